@@ -1,0 +1,1 @@
+"""What travels between the nodes of a rig: messages, topics, codec, bus and clocks."""

@@ -1,0 +1,259 @@
+"""The sending half of a ZeroMQ port: ROUTER with credit for each reader, and XPUB for watchers."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+import msgpack
+import zmq
+
+from ..codec import encode, size_bytes
+from ..envelope import Header, boot_id, host_name
+from ..errors import MessageError, QueueFullError
+from ..run_directory import Graph
+from ..schema import Message
+from ..topics import LATEST, LOSSLESS, Topic, find_topic
+from .port import PortEvent
+
+ZERO_COPY_BYTES = 65536
+"""Below this a copy is faster than sharing the buffer."""
+COMMAND_CREDIT_BYTES = 8 << 20
+MESSAGE_OVERHEAD_BYTES = 64
+WATCH_QUEUE_BYTES = 16 << 20
+"""What may wait for a slow watcher; older messages are dropped for it."""
+_BROKEN = (ValueError, KeyError, TypeError, AttributeError, msgpack.UnpackException)
+HELLO, CREDIT, WELCOME, REFUSED = b"!HELLO", b"!CREDIT", b"!WELCOME", b"!REFUSED"
+
+
+def readable(socket: zmq.Socket[bytes]) -> bool:
+    """Return whether a message waits in the socket."""
+    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+
+
+class _Reader:
+    """What is known of one registered reader, and how much it may still be sent."""
+
+    __slots__ = ("command", "identity", "incarnation", "lossless", "name", "topics")
+
+    def __init__(
+        self, name: str, identity: bytes, incarnation: str, topics: frozenset[str], credit: int
+    ) -> None:
+        self.name, self.identity, self.incarnation = name, identity, incarnation
+        self.topics = topics
+        self.lossless = credit
+        self.command = COMMAND_CREDIT_BYTES
+
+
+class ZmqPublisher:
+    """Sends one participant's messages. ``wait_for_credit`` returns False to give up."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        name: str,
+        incarnation: str,
+        context: zmq.Context[zmq.Socket[bytes]],
+        wait_for_credit: Callable[[], bool],
+    ) -> None:
+        me = graph.find(name)
+        self._name, self._incarnation = name, incarnation
+        self._topics = {topic: find_topic(topic) for topic in me.gives}
+        self._wanted = {
+            topic: frozenset(graph.readers(name, topic))
+            for topic, row in self._topics.items()
+            if row.quality != LATEST
+        }
+        self._live = me.live
+        self._wait_for_credit = wait_for_credit
+        self._sequence: defaultdict[str, int] = defaultdict(int)
+        self._readers: dict[str, _Reader] = {}
+        self._latched: dict[str, list[Any]] = {}
+        self._kept: dict[str, dict[str, list[Any]]] = defaultdict(dict)
+        self._watched: set[str] = set()
+        self.events: list[PortEvent] = []
+        self.sent, self.sent_bytes, self.undelivered, self.refused = 0, 0, 0, 0
+
+        self.router = context.socket(zmq.ROUTER)
+        self.router.linger = 1000
+        self.router.sndhwm = 0  # credit bounds the queue, in bytes
+        self.router.rcvhwm = 0
+        self.router.router_mandatory = True  # a reader that died is an error, not silence
+        self.router.bind(graph.endpoint(name, "lossless"))
+        self.watch = context.socket(zmq.XPUB)
+        self.watch.linger = 0
+        self.watch.xpub_verboser = True
+        big = any(topic.endswith("/frame") for topic in self._topics)
+        self.watch.sndhwm = 8 if big else 1000
+        self.watch.bind(graph.endpoint(name, "latest"))
+
+    # -- sending
+
+    def publish(self, name: str, message: Message, stamps: tuple[int, int, int], keep: str) -> bool:
+        """Send to all readers and watchers; False when a reader did not get it."""
+        topic = self._topics.get(name)
+        if topic is None:
+            raise MessageError(f"{self._name} does not give {name}")
+        sequence = self._sequence[name]
+        header = Header(self._name, self._incarnation, host_name(), boot_id(), sequence, *stamps)
+        parts = encode(topic, header, message)
+        self._sequence[name] = sequence + 1
+        if topic.latched:
+            self._latched[name] = parts
+        if keep:
+            self._kept[name][keep] = parts
+        size = size_bytes(parts) + MESSAGE_OVERHEAD_BYTES
+        delivered = True
+        for reader in self._wanted.get(name, ()):
+            delivered &= self._deliver(reader, topic, parts, size)
+        if name in self._watched:
+            self._send(self.watch, None, parts)
+        self.sent += 1
+        self.sent_bytes += size
+        return delivered
+
+    def release(self, topic: str, key: str) -> None:
+        """Forget a kept message."""
+        self._kept[topic].pop(key, None)
+
+    def next_sequence(self, topic: str) -> int:
+        """Return the sequence number of the next message on a topic."""
+        return self._sequence[topic]
+
+    def missing_readers(self) -> tuple[str, ...]:
+        """Return ``reader:topic`` for each reader that has not registered."""
+        return tuple(
+            f"{reader}:{topic}"
+            for topic, readers in sorted(self._wanted.items())
+            for reader in sorted(readers)
+            if reader not in self._readers or topic not in self._readers[reader].topics
+        )
+
+    def _deliver(self, name: str, topic: Topic, parts: list[Any], size: int) -> bool:
+        lossless = topic.quality == LOSSLESS
+        while True:
+            reader = self._readers.get(name)
+            if reader is not None and topic.name in reader.topics:
+                credit = reader.lossless if lossless else reader.command
+                if credit > 0:  # one message may overdraw, or none larger than all could pass
+                    try:
+                        self._send(self.router, reader.identity, parts)
+                    except zmq.ZMQError as error:
+                        if error.errno not in (zmq.EHOSTUNREACH, zmq.EAGAIN):
+                            raise
+                        self._readers.pop(name, None)  # it died; wait for its successor
+                        continue
+                    if lossless:
+                        reader.lossless -= size
+                    else:
+                        reader.command -= size
+                    return True
+                if not lossless:
+                    raise QueueFullError(
+                        f"{name} has not read {topic.name} from {self._name} for too long: "
+                        f"{COMMAND_CREDIT_BYTES} bytes are waiting"
+                    )
+            elif not lossless:
+                self.undelivered += not topic.latched
+                return False
+            if self._live or not self._wait_for_credit():
+                self.undelivered += 1
+                return False
+
+    @staticmethod
+    def _send(socket: zmq.Socket[bytes], identity: bytes | None, parts: list[Any]) -> None:
+        flags = zmq.DONTWAIT
+        if identity is not None:
+            socket.send(identity, flags | zmq.SNDMORE)
+        last = len(parts) - 1
+        for index, part in enumerate(parts):
+            more = zmq.SNDMORE if index < last else 0
+            share = hasattr(part, "nbytes") and part.nbytes >= ZERO_COPY_BYTES
+            socket.send(part, flags | more, copy=not share)
+
+    # -- what readers and watchers say
+
+    def service(self) -> None:
+        """Take registrations, credit and watchers' subscriptions that have arrived."""
+        while readable(self.watch):
+            self._take_subscription(self.watch.recv(zmq.DONTWAIT))
+        while readable(self.router):
+            parts = self.router.recv_multipart(zmq.DONTWAIT)
+            try:
+                self._take(parts)
+            except (
+                ValueError,
+                KeyError,
+                TypeError,
+                AttributeError,
+                msgpack.UnpackException,
+            ) as bad:
+                self.refused += 1
+                self.events.append(PortEvent("refused", "unknown", text=f"{bad!s:.200}"))
+
+    def _take_subscription(self, raw: bytes) -> None:
+        if not raw or raw[0] not in (0, 1):
+            return
+        prefix = raw[1:].decode(errors="replace")
+        names = {name for name in self._topics if name.startswith(prefix)}
+        if raw[0]:
+            self._watched |= names
+            for name in names & self._latched.keys():
+                self._send(self.watch, None, self._latched[name])
+        # An end of watching is not acted on: another watcher may remain, and XPUB drops for none.
+
+    def _take(self, parts: list[bytes]) -> None:
+        identity, kind, body = parts
+        if kind == CREDIT:
+            lossless, command = msgpack.unpackb(body)
+            for reader in self._readers.values():
+                if reader.identity == identity:
+                    reader.lossless += int(lossless)
+                    reader.command += int(command)
+        elif kind == HELLO:
+            self._register(identity, msgpack.unpackb(body))
+        else:
+            raise MessageError(f"{kind!r:.40} is not what a reader says")
+
+    def _register(self, identity: bytes, hello: dict[str, Any]) -> None:
+        name, incarnation = str(hello["reader"]), str(hello["incarnation"])
+        topics = frozenset(map(str, hello["topics"]))
+        unnamed = [t for t in sorted(topics) if name not in self._wanted.get(t, ())]
+        if unnamed:
+            reason = f"the graph names no reader {name!r} of {', '.join(unnamed)} from {self._name}"
+            self._say(identity, REFUSED, {"reason": reason})
+            raise MessageError(reason)
+        old = self._readers.get(name)
+        if old is not None and old.identity == identity and old.incarnation == incarnation:
+            return
+        reader = _Reader(name, identity, incarnation, topics, int(hello["credit_bytes"]))
+        self._readers[name] = reader
+        self._say(
+            identity,
+            WELCOME,
+            {
+                "publisher": self._name,
+                "incarnation": self._incarnation,
+                "next": {topic: self._sequence[topic] for topic in topics},
+            },
+        )
+        for topic in sorted(topics):
+            again = list(self._kept[topic].values())
+            if topic in self._latched:
+                again.append(self._latched[topic])
+            for parts in again:
+                self._send(self.router, identity, parts)
+                if self._topics[topic].quality == LOSSLESS:
+                    reader.lossless -= size_bytes(parts) + MESSAGE_OVERHEAD_BYTES
+                else:
+                    reader.command -= size_bytes(parts) + MESSAGE_OVERHEAD_BYTES
+        self.events.append(PortEvent("reader", name, incarnation))
+
+    def _say(self, identity: bytes, kind: bytes, body: dict[str, Any]) -> None:
+        self.router.send_multipart([identity, kind, msgpack.packb(body)], zmq.DONTWAIT)
+
+    def close(self) -> None:
+        """Close both sockets; what was sent lingers for a second."""
+        self.router.close()
+        self.watch.close()

@@ -1,0 +1,58 @@
+"""A message with its topic and header, as handlers receive it."""
+
+from __future__ import annotations
+
+import socket
+import uuid
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+from .schema import Message
+
+
+class Header(NamedTuple):
+    """Who sent a message, as which of its kind, and when what it tells happened.
+
+    All times are integer nanoseconds: ``stamp_ns`` and ``received_ns`` on the run's clock,
+    ``hardware_ns`` on the device's own; 0 where one does not apply.
+    """
+
+    publisher: str
+    incarnation: str
+    host: str
+    boot_id: str
+    sequence: int
+    stamp_ns: int
+    received_ns: int = 0
+    hardware_ns: int = 0
+
+
+class Envelope(NamedTuple):
+    """A message on a topic. Sort by :func:`order` to become independent of arrival."""
+
+    topic: str
+    header: Header
+    message: Message
+
+    def order(self) -> tuple[str, str, str, int]:
+        """Return the key in which joined inputs are worked through."""
+        return (self.topic, self.header.publisher, self.header.incarnation, self.header.sequence)
+
+
+def new_incarnation() -> str:
+    """Return a name for one life of a process; a restarted one gets another."""
+    return uuid.uuid4().hex[:12]
+
+
+@cache
+def host_name() -> str:
+    """Return this host's name."""
+    return socket.gethostname()
+
+
+@cache
+def boot_id() -> str:
+    """Return this boot's id: monotonic clocks of one boot can be compared."""
+    path = Path("/proc/sys/kernel/random/boot_id")
+    return path.read_text().strip()[:13] if path.exists() else "unknown"

@@ -1,0 +1,18 @@
+"""Fixtures that every package's tests share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder with real measured data, or a skip that says where it was looked for."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    path = Path(os.environ.get("TVBRDF_SHARED_DATA", default))
+    if not path.is_dir():
+        pytest.skip(f"no measured data at {path}; set TVBRDF_SHARED_DATA to its folder")
+    return path
