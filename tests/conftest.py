@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+# before anything loads numpy: several workers with several threads each stand in each other's way
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

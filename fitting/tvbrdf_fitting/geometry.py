@@ -1,0 +1,82 @@
+"""Directions of light and cameras on the rig, in the sample's frame.
+
+Frame: right-handed, unit vectors, z the sample's normal, x in the light's plane, y in the cameras'
+plane. The light's plane is perpendicular to the cameras' plane; the plate that carries the sample
+is tilted in the light's plane, so that the arm does not hide the specular peak from the top camera.
+
+Source: Sun, Sunkavalli, Ramamoorthi, Belhumeur, Nayar, "Time-Varying BRDFs", section on the
+acquisition system, and the published database, whose `L` and `V` lines these formulas reproduce.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+CAMERA_ANGLES_DEG = (0.0, 25.0, 50.0, 75.0)
+"""Cameras 1 to 4, from the vertical."""
+TILT_DEG = 12.0
+"""Tilt of the sample plate in the light's plane."""
+HORIZON_COSINE = 1e-3
+"""A direction whose cosine to the normal is below this counts as below the sample's horizon."""
+CHANNELS = ("b", "g", "r")
+"""Order of the colour channels, everywhere."""
+
+
+def light_direction(world_angle_deg: ArrayLike, tilt_deg: float = TILT_DEG) -> FloatArray:
+    """Unit vectors from the sample to the light.
+
+    Parameters
+    ----------
+    world_angle_deg
+        Angle(s) of the light from the vertical, in [-90, 90] degrees over a sweep; any shape.
+    tilt_deg
+        Tilt of the plate in degrees.
+
+    Returns
+    -------
+    array of shape (..., 3): (n, 3) for n angles, (3,) for a single number
+    """
+    angle = np.deg2rad(np.asarray(world_angle_deg, dtype=np.float64) - tilt_deg)
+    return np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
+
+
+def view_direction(camera_angle_deg: float, tilt_deg: float = TILT_DEG) -> FloatArray:
+    """Unit vector (3,) from the sample to a camera at an angle in degrees from the vertical."""
+    angle, tilt = np.deg2rad(float(camera_angle_deg)), np.deg2rad(float(tilt_deg))
+    return np.array([-np.cos(angle) * np.sin(tilt), np.sin(angle), np.cos(angle) * np.cos(tilt)])
+
+
+def light_world_angle_deg(direction: ArrayLike, tilt_deg: float = TILT_DEG) -> FloatArray:
+    """World angle in degrees of light directions (..., 3): the inverse of `light_direction`.
+
+    A component out of the light's plane is ignored. The answer lies in (-180, 180] + tilt.
+    """
+    vectors = _vectors(direction)
+    return np.rad2deg(np.arctan2(vectors[..., 0], vectors[..., 2])) + tilt_deg
+
+
+def above_horizon(direction: ArrayLike) -> BoolArray:
+    """Mask (...) of the directions (..., 3) that are clearly above the sample's horizon."""
+    return np.asarray(_vectors(direction)[..., 2] >= HORIZON_COSINE)
+
+
+def turned_in_light_plane(direction: ArrayLike, angle_deg: float) -> FloatArray:
+    """Directions (..., 3) turned as if the light's world angle were larger by `angle_deg`."""
+    vectors = _vectors(direction)
+    angle = np.deg2rad(angle_deg)
+    turned = vectors.copy()
+    turned[..., 0] = np.cos(angle) * vectors[..., 0] + np.sin(angle) * vectors[..., 2]
+    turned[..., 2] = np.cos(angle) * vectors[..., 2] - np.sin(angle) * vectors[..., 0]
+    return turned
+
+
+def _vectors(direction: ArrayLike) -> FloatArray:
+    vectors = np.asarray(direction, dtype=np.float64)
+    if vectors.ndim == 0 or vectors.shape[-1] != 3:
+        raise ValueError(f"directions must have three components last, got shape {vectors.shape}")
+    return vectors
