@@ -1,0 +1,1 @@
+"""Keeps what was measured and fitted: published text files, observations, catalogue."""

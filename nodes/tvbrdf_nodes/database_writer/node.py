@@ -1,0 +1,253 @@
+"""The database writer: puts every scan on disk exactly once, and says when it is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from tvbrdf_messages.envelope import Envelope
+from tvbrdf_messages.messages import (
+    DatabaseState,
+    Mark,
+    Parameters,
+    Radiance,
+    ScanMissing,
+    Stored,
+)
+
+from ..core.device import DeviceError
+from ..core.node import Node, NodeContext, Outputs, Send, TopicUse
+
+if TYPE_CHECKING:
+    from tvbrdf_fitting.published_scan import CameraScan
+
+    from .records import FitRecord, ScanRecord
+    from .store import DatabaseStore, Outcome
+
+RETRY_S = 5.0
+"""Real time after which a full disk is tried again."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatabaseWriterParameters:
+    """Where what is measured goes."""
+
+    path: str
+    sample: str
+    process: str = ""
+    """What the sample does, for the published info file."""
+    resume: bool = False
+    """Go on in a database of the same sample that is not empty."""
+
+
+class DatabaseWriterNode(Node[DatabaseWriterParameters]):
+    """Stores scans, parameters, missing scans and notes; acknowledges each."""
+
+    parameters_type = DatabaseWriterParameters
+
+    def __init__(self, context: NodeContext, parameters: DatabaseWriterParameters) -> None:
+        super().__init__(context, parameters)
+        self._store: DatabaseStore | None = None
+        self._waiting: list[Envelope] = []
+        """What could not be stored yet: the disk was full, or the scan itself has not come."""
+        self._stored = self._repeats = 0
+
+    @classmethod
+    def topics(cls, name: str, parameters: DatabaseWriterParameters) -> TopicUse:
+        """See :class:`~tvbrdf_nodes.core.node.Node`."""
+        return TopicUse(
+            takes=(
+                "/clock",
+                "/scan/radiance",
+                "/scan/parameters",
+                "/scan/missing",
+                "/operator/mark",
+            ),
+            gives=("/scan/stored", "/scan/database", "/diagnostics", "/log"),
+        )
+
+    def prepare(self) -> None:
+        """Open the database; one that can't be used ends the run before anything moves."""
+        from tvbrdf_fitting.published_database import DatabaseError
+
+        from .store import DatabaseStore
+
+        try:
+            self._store = DatabaseStore(
+                self.parameters.path,
+                self.parameters.sample,
+                resume=self.parameters.resume,
+                process=self.parameters.process,
+                run_id=self.context.run_directory.name,
+            )
+        except DatabaseError as error:
+            raise DeviceError(str(error)) from error
+
+    def start(self) -> Outputs:
+        """Tell what the database holds."""
+        store = self._opened()
+        yield Send(
+            topic="/scan/database",
+            message=DatabaseState(
+                sample=self.parameters.sample,
+                scans=store.stored_scans(),
+                fitted=store.fitted_scans(),
+                missing=tuple(store.missing_scans()),
+                zero_ns=store.zero_ns(),
+            ),
+        )
+
+    def handle(self, envelope: Envelope) -> Outputs:
+        """Store a message; what has to wait is tried again later."""
+        self._waiting.append(envelope)
+        yield from self._work()
+
+    def on_timer(self, name: str) -> Outputs:
+        """Try again what a full disk had refused."""
+        yield from self._work()
+
+    def _work(self) -> Outputs:
+        """Store what can be stored, radiance first; keep the rest."""
+        from tvbrdf_fitting.published_database import DatabaseError, DiskFullError
+
+        waiting, self._waiting = self._waiting, []
+        for envelope in sorted(waiting, key=lambda e: not isinstance(e.message, Radiance)):
+            message = envelope.message
+            try:
+                if isinstance(message, Parameters) and not self._has_scan(message.scan):
+                    self._waiting.append(envelope)
+                    continue
+                scan, what, outcome = self._put(envelope)
+            except DiskFullError as error:
+                self.context.log.error(f"{error}; trying again every {RETRY_S:g} s")
+                self._waiting.append(envelope)
+                self.context.set_watchdog("retry", RETRY_S)
+                continue
+            except DatabaseError as error:
+                # refused for what it is, so sending it again would not help; say so and go on
+                self.context.log.error(str(error))
+                continue
+            already = outcome == "already_stored"
+            self._stored += not already
+            self._repeats += already
+            yield Send(
+                topic="/scan/stored",
+                message=Stored(
+                    sample=self.parameters.sample, scan=scan, what=what, already=already
+                ),
+            )
+
+    def _put(self, envelope: Envelope) -> tuple[int, str, Outcome]:
+        store, message = self._opened(), envelope.message
+        if isinstance(message, Radiance):
+            return message.scan, "radiance", store.store_scan(scan_record(message))
+        if isinstance(message, Parameters):
+            return message.scan, "parameters", store.store_parameters(fit_record(message))
+        if isinstance(message, ScanMissing):
+            outcome = store.store_missing(message.scan, message.reason, time_s=message.scan_time_s)
+            return message.scan, "missing", outcome
+        if isinstance(message, Mark):
+            outcome = store.store_note(envelope.header.stamp_ns, message.text, zero=message.zero)
+            return envelope.header.sequence, "mark", outcome
+        raise TypeError(f"{envelope.topic} is not for the database")
+
+    def _has_scan(self, scan: int) -> bool:
+        return scan in self._opened().stored_scans()
+
+    def _opened(self) -> DatabaseStore:
+        if self._store is None:
+            raise DeviceError("the database is not open")
+        return self._store
+
+    def stop(self) -> Outputs:
+        """Close the database; everything acknowledged is on disk already."""
+        if self._store is not None:
+            self._store.close()
+        return ()
+
+    def diagnostics(self) -> dict[str, Any]:
+        """See :class:`~tvbrdf_nodes.core.node.Node`."""
+        return {
+            "stored": self._stored,
+            "already_stored": self._repeats,
+            "waiting": len(self._waiting),
+        }
+
+
+def scan_record(radiance: Radiance) -> ScanRecord:
+    """Return what the store keeps of a message."""
+    from .records import ScanRecord
+
+    names = (
+        "camera",
+        "sweep",
+        "exposure_ms",
+        "stamp_ns",
+        "light_angle_deg",
+        "light_direction",
+        "view_direction",
+        "radiance",
+        "variance",
+        "valid",
+        "light_angle_std_deg",
+        "grid_angle_deg",
+        "grid_radiance",
+        "grid_variance",
+        "grid_valid",
+    )
+    return ScanRecord(
+        sample=radiance.sample,
+        scan=radiance.scan,
+        start_stamp_ns=radiance.scan_start_ns,
+        time_s=radiance.scan_time_s,
+        exposures_ms=radiance.exposures_ms,
+        grid=_grid(radiance),
+        observations={name: getattr(radiance, name) for name in names},
+        quality={**radiance.quality, "gain_relative_std": radiance.gain_relative_std},
+    )
+
+
+def _grid(radiance: Radiance) -> dict[int, CameraScan]:
+    """Return each camera's radiance on the grid, without what is not valid."""
+    from tvbrdf_fitting.geometry import light_direction
+    from tvbrdf_fitting.published_scan import CameraScan
+
+    grid: dict[int, CameraScan] = {}
+    for index in range(radiance.grid_radiance.shape[0]):
+        seen = radiance.camera == index + 1
+        if not seen.any():
+            continue
+        valid = radiance.grid_valid[index].all(axis=1)
+        grid[index + 1] = CameraScan(
+            exposures_ms=radiance.exposures_ms,
+            light_direction=light_direction(radiance.grid_angle_deg[valid]),
+            view_direction=radiance.view_direction[seen][0],
+            radiance=radiance.grid_radiance[index][valid],
+        )
+    return grid
+
+
+def fit_record(parameters: Parameters) -> FitRecord:
+    """Return what the store keeps of a message."""
+    from .records import FitRecord
+
+    return FitRecord(
+        sample=parameters.sample,
+        scan=parameters.scan,
+        model=parameters.model,
+        parameter_names=parameters.parameter_names,
+        values=parameters.values,
+        standard_deviations=parameters.standard_deviations,
+        covariance=parameters.covariance,
+        errors={
+            **parameters.errors,
+            "chi_square": parameters.chi_square,
+            "degrees_of_freedom": parameters.degrees_of_freedom,
+        },
+        solver=parameters.solver,
+        reason=parameters.reason,
+        evaluations=parameters.evaluations,
+        solve_time_ms=parameters.solve_time_ms,
+        at_bound=parameters.at_bound,
+        undetermined=parameters.undetermined,
+    )
