@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # numpy is loaded by those who touch arrays only
     Bools = NDArray[np.bool_]
     Doubles = NDArray[np.float64]
     Longs = NDArray[np.int64]
-    Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+    Pixels = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from .errors import MessageError
 
-_SCALARS: dict[str, type] = {"int": int, "float": float, "str": str, "bool": bool}
+SCALARS: dict[str, type] = {"int": int, "float": float, "str": str, "bool": bool}
 
 
 class ArraySpec(NamedTuple):
@@ -57,8 +57,8 @@ def _checker(annotation: str, where: str) -> Callable[[Any], bool]:
     if text == "float":
         # msgpack keeps 1 and 1.0 apart; a whole number is a legal float
         return lambda value: type(value) is float or type(value) is int
-    if text in _SCALARS:
-        kind = _SCALARS[text]
+    if text in SCALARS:
+        kind = SCALARS[text]
         return lambda value: type(value) is kind
     if text.startswith("tuple[") and text.endswith(",...]"):
         item = _checker(text[len("tuple[") : -len(",...]")], where)

@@ -41,7 +41,8 @@ class Port(Protocol):
         """Send a message to every reader that the graph names.
 
         With ``keep``, it is kept under that key and sent again to a restarted reader until
-        :meth:`release`. Waits for credit on a lossless topic; a live source does not wait: then
+        :meth:`release`. Small lossless messages may wait to travel together until the port is
+        serviced, which its owner does before it waits for anything. Waits for credit on a lossless topic; a live source does not wait: then
         ``False`` says that a reader did not get it.
         """
         ...

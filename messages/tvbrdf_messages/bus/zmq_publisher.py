@@ -19,6 +19,8 @@ from .port import PortEvent
 
 ZERO_COPY_BYTES = 65536
 """Below this a copy is faster than sharing the buffer."""
+TOGETHER_BYTES = 16384
+"""Small lossless messages wait for each other up to this size, or until :meth:`flush`."""
 COMMAND_CREDIT_BYTES = 8 << 20
 MESSAGE_OVERHEAD_BYTES = 64
 WATCH_QUEUE_BYTES = 16 << 20
@@ -35,7 +37,17 @@ def readable(socket: zmq.Socket[bytes]) -> bool:
 class _Reader:
     """What is known of one registered reader, and how much it may still be sent."""
 
-    __slots__ = ("command", "identity", "incarnation", "lossless", "name", "topics")
+    __slots__ = (
+        "command",
+        "identity",
+        "incarnation",
+        "lossless",
+        "name",
+        "topics",
+        "waiting",
+        "waiting_bytes",
+        "waiting_topic",
+    )
 
     def __init__(
         self, name: str, identity: bytes, incarnation: str, topics: frozenset[str], credit: int
@@ -44,6 +56,9 @@ class _Reader:
         self.topics = topics
         self.lossless = credit
         self.command = COMMAND_CREDIT_BYTES
+        self.waiting: list[bytes] = []  # small messages of one topic, to be sent together
+        self.waiting_topic = b""
+        self.waiting_bytes = 0
 
 
 class ZmqPublisher:
@@ -68,6 +83,7 @@ class ZmqPublisher:
         self._live = me.live
         self._wait_for_credit = wait_for_credit
         self._sequence: defaultdict[str, int] = defaultdict(int)
+        self._who = (name, incarnation, host_name(), boot_id())
         self._readers: dict[str, _Reader] = {}
         self._latched: dict[str, list[Any]] = {}
         self._kept: dict[str, dict[str, list[Any]]] = defaultdict(dict)
@@ -96,7 +112,7 @@ class ZmqPublisher:
         if topic is None:
             raise MessageError(f"{self._name} does not give {name}")
         sequence = self._sequence[name]
-        header = Header(self._name, self._incarnation, host_name(), boot_id(), sequence, *stamps)
+        header = Header(*self._who, sequence, *stamps)
         parts = encode(topic, header, message)
         self._sequence[name] = sequence + 1
         if topic.latched:
@@ -137,13 +153,9 @@ class ZmqPublisher:
             if reader is not None and topic.name in reader.topics:
                 credit = reader.lossless if lossless else reader.command
                 if credit > 0:  # one message may overdraw, or none larger than all could pass
-                    try:
-                        self._send(self.router, reader.identity, parts)
-                    except zmq.ZMQError as error:
-                        if error.errno not in (zmq.EHOSTUNREACH, zmq.EAGAIN):
-                            raise
-                        self._readers.pop(name, None)  # it died; wait for its successor
-                        continue
+                    together = lossless and len(parts) == 2
+                    if not (self._join(reader, parts) if together else self._post(reader, parts)):
+                        continue  # it died; wait for its successor
                     if lossless:
                         reader.lossless -= size
                     else:
@@ -161,6 +173,39 @@ class ZmqPublisher:
                 self.undelivered += 1
                 return False
 
+    def _join(self, reader: _Reader, parts: list[Any]) -> bool:
+        """Put a small message beside those that wait, and send them when they are enough."""
+        topic, body = parts
+        if reader.waiting and reader.waiting_topic != topic and not self._flush(reader):
+            return False
+        reader.waiting.append(body)
+        reader.waiting_topic = topic
+        reader.waiting_bytes += len(body)
+        return reader.waiting_bytes < TOGETHER_BYTES or self._flush(reader)
+
+    def _post(self, reader: _Reader, parts: list[Any]) -> bool:
+        """Send at once, after what waits; False if the reader is gone."""
+        if reader.waiting and not self._flush(reader):
+            return False
+        try:
+            self._send(self.router, reader.identity, parts)
+        except zmq.ZMQError as error:
+            if error.errno not in (zmq.EHOSTUNREACH, zmq.EAGAIN):
+                raise
+            self._readers.pop(reader.name, None)
+            return False
+        return True
+
+    def _flush(self, reader: _Reader) -> bool:
+        bodies, reader.waiting, reader.waiting_bytes = reader.waiting, [], 0
+        return self._post(reader, [reader.waiting_topic, b"".join(bodies)])
+
+    def flush(self) -> None:
+        """Send the small messages that wait to be sent together."""
+        for reader in list(self._readers.values()):
+            if reader.waiting:
+                self._flush(reader)
+
     @staticmethod
     def _send(socket: zmq.Socket[bytes], identity: bytes | None, parts: list[Any]) -> None:
         flags = zmq.DONTWAIT
@@ -176,6 +221,7 @@ class ZmqPublisher:
 
     def service(self) -> None:
         """Take registrations, credit and watchers' subscriptions that have arrived."""
+        self.flush()
         while readable(self.watch):
             self._take_subscription(self.watch.recv(zmq.DONTWAIT))
         while readable(self.router):

@@ -8,7 +8,7 @@ import msgpack
 import zmq
 from zmq.utils.monitor import parse_monitor_message
 
-from ..codec import decode, size_bytes
+from ..codec import decode_all, size_bytes
 from ..envelope import Envelope
 from ..errors import MessageError
 from ..run_directory import Graph
@@ -38,10 +38,10 @@ class _Link:
     def note_size(self, size: int, lossless: bool) -> None:
         self.taken[0 if lossless else 1] += size
 
-    def give_credit(self, force: bool) -> None:
+    def give_credit(self) -> None:
         """Give back the credit of what was handled, in few messages."""
         lossless, command = self.handled
-        if (lossless or command) and (force or lossless + command > self.credit_bytes // 16):
+        if lossless + command > min(self.credit_bytes // 16, 1 << 20):
             self.socket.send_multipart([CREDIT, msgpack.packb(self.handled)], zmq.DONTWAIT)
             self.handled = [0, 0]
 
@@ -126,10 +126,9 @@ class ZmqSubscriber:
             link.handled[0] += link.taken[0]
             link.handled[1] += link.taken[1]
             link.taken = [0, 0]
-            before = len(found)
             while len(found) < limit and readable(link.socket):
                 self._receive_one(link, found)
-            link.give_credit(force=len(found) == before)
+            link.give_credit()
         while self.latest is not None and len(found) < limit and readable(self.latest):
             self._decode(_receive_parts(self.latest), found)
         return found
@@ -145,15 +144,17 @@ class ZmqSubscriber:
         if len(found) == count:
             link.note_size(size, lossless=True)
             return
-        envelope = found[-1]
-        link.note_size(size, find_topic(envelope.topic).quality == LOSSLESS)
-        self.received += 1
+        # those that travelled together share one topic frame, but each has paid for it
+        size += (MESSAGE_OVERHEAD_BYTES + len(parts[0])) * (len(found) - count - 1)
+        link.note_size(size, find_topic(found[-1].topic).quality == LOSSLESS)
+        self.received += len(found) - count
         self.received_bytes += size
-        self._count_gap(link, envelope)
+        for envelope in found[count:]:
+            self._count_gap(link, envelope)
 
     def _decode(self, parts: list[Any], found: list[Envelope]) -> None:
         try:
-            found.append(decode(parts))
+            found.extend(decode_all(parts))
         except MessageError as error:
             self.refused += 1
             self.events.append(PortEvent("refused", "unknown", text=f"{error!s:.200}"))

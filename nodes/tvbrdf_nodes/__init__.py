@@ -1,0 +1,1 @@
+"""The processes of a rig: one folder a node, with its drivers and its simulated twin."""

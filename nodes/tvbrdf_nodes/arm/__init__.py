@@ -1,0 +1,1 @@
+"""The arm: moves the light on its half circle, behind a serial line."""

@@ -1,0 +1,1 @@
+"""The camera: its node, the driver interface, real drivers, and the simulated camera."""

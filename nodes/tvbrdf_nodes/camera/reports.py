@@ -1,0 +1,82 @@
+"""What a camera node says: what its camera is, what came of a command, and why it won't do."""
+
+from __future__ import annotations
+
+from tvbrdf_messages.messages import CameraInfo, ScanCommand, SweepResult
+
+from .driver import CameraIdentity, CameraSettings, Region
+
+EXPOSURE_TOLERANCE = 0.01
+"""Relative difference of an exposure as read back from the one that was asked for."""
+
+
+def answer(
+    source: str,
+    command: ScanCommand,
+    reason: str = "",
+    *,
+    state: str = "done",
+    frames: int = 0,
+    first_sequence: int = -1,
+    last_sequence: int = -1,
+    exposure_ms: float = 0.0,
+) -> SweepResult:
+    """Return what came of a command."""
+    return SweepResult(
+        source=source,
+        command_id=command.command_id,
+        action=command.action,
+        state=state,
+        reason=reason,
+        sample=command.sample,
+        scan=command.scan,
+        sweep=command.sweep,
+        attempt=command.attempt,
+        frames=frames,
+        first_sequence=first_sequence,
+        last_sequence=last_sequence,
+        exposure_ms=exposure_ms,
+    )
+
+
+def camera_info(name: str, identity: CameraIdentity, settings: CameraSettings) -> CameraInfo:
+    """Return what a camera is and how it is set."""
+    region = settings.region or Region(0, 0, identity.width, identity.height)
+    return CameraInfo(
+        camera=name,
+        model=identity.model,
+        serial=identity.serial,
+        width=region.width,
+        height=region.height,
+        bit_depth=identity.bit_depth,
+        region_x=region.x,
+        region_y=region.y,
+        hardware_stamps=identity.hardware_stamps,
+        exact_exposure=identity.exact_exposure,
+        frame_rate_hz=settings.frame_rate_hz,
+    )
+
+
+def differ(exposure_ms: float, other_ms: float) -> bool:
+    """Return whether two exposures are not the same."""
+    return abs(exposure_ms - other_ms) > EXPOSURE_TOLERANCE * other_ms
+
+
+def wrong_exposure(identity: CameraIdentity, wanted_ms: float, read_back_ms: float) -> str:
+    """Return what is wrong with an exposure that was read back; empty if nothing is."""
+    if not identity.exact_exposure or not differ(read_back_ms, wanted_ms):
+        return ""
+    return f"exposure is {read_back_ms:g} ms as read back, not {wanted_ms:g} ms"
+
+
+def unfit_for_scans(identity: CameraIdentity) -> str:
+    """Return why a camera can't take part in a scan; empty if it can."""
+    lacks = []
+    if not identity.exact_exposure:
+        lacks.append("can't set its exposure exactly")
+    if not identity.hardware_stamps:
+        lacks.append("gives no hardware stamps")
+    if not lacks:
+        return ""
+    text = f"{identity.model} {' and '.join(lacks)}"
+    return f"{text}; to scan all the same set approximate_timing: true"

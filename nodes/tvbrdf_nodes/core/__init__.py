@@ -1,0 +1,1 @@
+"""What all nodes share: the node class, the two shells, drivers, parameters."""

@@ -1,0 +1,221 @@
+"""What both shells share: a node's context, its timers, and the way of its outputs."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tvbrdf_messages.bus import Port
+from tvbrdf_messages.clock import RunClock, ToldClock
+from tvbrdf_messages.errors import BusError
+from tvbrdf_messages.messages import Clock, Diagnostics, Log
+from tvbrdf_messages.run_directory import Graph
+from tvbrdf_messages.topics import LOSSLESS, find_topic
+
+from .loading import load_class
+from .node import Exit, Logger, Node, Outputs, Release, Reply, Send
+from .parameters import ParameterError, build
+
+WAITING, READY, RUNNING, FAULT, STOPPING = "waiting", "ready", "running", "fault", "stopping"
+
+
+class _Log:
+    """A node's log: a line on standard error, and a message on ``/log``."""
+
+    def __init__(self, runner: NodeRunner) -> None:
+        self._runner = runner
+
+    def info(self, text: str) -> None:
+        self._say("info", text)
+
+    def warning(self, text: str) -> None:
+        self._say("warning", text)
+
+    def error(self, text: str) -> None:
+        self._say("error", text)
+
+    def _say(self, level: str, text: str) -> None:
+        runner = self._runner
+        if runner.log_to_stderr:
+            stamp = time.strftime("%H:%M:%S", time.gmtime(runner.clock.now_ns() // 1_000_000_000))
+            sys.stderr.write(f"{stamp} {level:7} {runner.name}: {text}\n")
+        if "/log" in runner.gives:
+            runner.port.publish(
+                "/log",
+                Log(node=runner.name, level=level, text=text),
+                stamp_ns=runner.clock.now_ns(),
+            )
+
+
+class NodeRunner:
+    """Owns one node and its port; implements the node's context.
+
+    Parameters
+    ----------
+    graph, name
+        The run's graph and the node's name in it.
+    clock
+        The run's clock.
+    port
+        The node's place on the bus.
+    open_link
+        Opens a further port of this process by its name in the graph.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        name: str,
+        clock: RunClock,
+        port: Port,
+        open_link: Callable[[str], Port],
+        *,
+        log_to_stderr: bool = True,
+    ) -> None:
+        self.graph, self.name, self.clock, self.port = graph, name, clock, port
+        self.incarnation = port.incarnation
+        self.run_directory = Path(graph.directory)
+        self.open_link = open_link
+        self.log_to_stderr = log_to_stderr
+        me = graph.find(name)
+        self.gives, self.live = frozenset(me.gives), me.live
+        self.log: Logger = _Log(self)
+        self.state, self.state_text = WAITING, ""
+        self.exit: Exit | None = None
+        self.replies: list[Reply] = []
+        self._timers: dict[str, int] = {}
+        self._watchdogs: dict[str, float] = {}
+        node_class: type[Node[Any]] = load_class(me.node)
+        try:
+            parameters = build(node_class.parameters_type, me.parameters)
+        except ParameterError as error:
+            raise BusError(f"node {name}: {error}") from error
+        self.node = node_class(self, parameters)
+
+    # -- the node's context
+
+    def set_timer(self, name: str, at_ns: int) -> None:
+        """See :class:`.node.NodeContext`."""
+        self._timers[name] = at_ns
+
+    def set_watchdog(self, name: str, after_s: float) -> None:
+        """See :class:`.node.NodeContext`."""
+        self._watchdogs[name] = time.monotonic() + after_s
+
+    def cancel(self, name: str) -> None:
+        """See :class:`.node.NodeContext`."""
+        self._timers.pop(name, None)
+        self._watchdogs.pop(name, None)
+
+    def next_sequence(self, topic: str) -> int:
+        """See :class:`.node.NodeContext`."""
+        return self.port.next_sequence(topic)
+
+    # -- running it
+
+    def next_timer_ns(self) -> int | None:
+        """Return the run-clock time of the next timer."""
+        return min(self._timers.values(), default=None)
+
+    def next_watchdog_s(self) -> float | None:
+        """Return in how many seconds the next watchdog runs out."""
+        if not self._watchdogs:
+            return None
+        return max(0.0, min(self._watchdogs.values()) - time.monotonic())
+
+    def fire_timers(self) -> bool:
+        """Call the node for every timer and watchdog that has run out; say whether any had."""
+        now_ns, now_s = self.clock.now_ns(), time.monotonic()
+        due = [(at, name) for name, at in self._timers.items() if at <= now_ns]
+        late = [(at, name) for name, at in self._watchdogs.items() if at <= now_s]
+        for _, name in sorted(due):
+            if self._timers.get(name, now_ns + 1) <= now_ns:
+                del self._timers[name]
+                self.put(self.node.on_timer(name))
+        for _, name in sorted(late):
+            if self._watchdogs.pop(name, None) is not None:
+                self.put(self.node.on_timer(name))
+        return bool(due or late)
+
+    def take_messages(self, limit: int = 64) -> bool:
+        """Hand arrived messages and events to the node; say whether there were any."""
+        found = self.port.receive(limit)
+        for envelope in found:
+            if envelope.topic == "/clock" and isinstance(envelope.message, Clock):
+                if isinstance(self.clock, ToldClock):
+                    self.clock.tell(envelope.message.now_ns, envelope.message.epoch)
+                continue
+            self.put(self.node.handle(envelope))
+        events = self.port.events()
+        for event in events:
+            if event.kind == "refused":
+                self.log.warning(f"refused from {event.name}: {event.text}")
+            elif self.state == RUNNING:
+                handler = {
+                    "reader": self.node.on_reader,
+                    "lost": self.node.on_lost,
+                    "found": self.node.on_found,
+                }[event.kind]
+                self.put(handler(event.name))
+        return bool(found or events)
+
+    def put(self, outputs: Outputs) -> None:
+        """Carry out what a handler returned."""
+        for output in outputs:
+            if isinstance(output, Send):
+                self._publish(output)
+            elif isinstance(output, Release):
+                self.port.release(output.topic, output.key)
+            elif isinstance(output, Reply):
+                self.replies.append(output)
+            else:
+                self.exit = output
+
+    def _publish(self, send: Send) -> None:
+        if isinstance(send.message, Clock) and isinstance(self.clock, ToldClock):
+            self.clock.tell(send.message.now_ns, send.message.epoch)  # its owner lives by it too
+        delivered = self.port.publish(
+            send.topic,
+            send.message,
+            stamp_ns=self.clock.now_ns() if send.stamp_ns is None else send.stamp_ns,
+            received_ns=send.received_ns,
+            hardware_ns=send.hardware_ns,
+            keep=send.keep,
+        )
+        if not delivered and self.live and find_topic(send.topic).quality == LOSSLESS:
+            self.put(self.node.on_overflow(send.topic))
+
+    def set_state(self, state: str, text: str = "") -> None:
+        """Change the node's state and tell it."""
+        self.state, self.state_text = state, text
+        self.tell_diagnostics()
+
+    def tell_diagnostics(self) -> None:
+        """Publish how the node is."""
+        if "/diagnostics" not in self.gives:
+            return
+        self.port.publish(
+            "/diagnostics",
+            Diagnostics(
+                node=self.name,
+                state=self.state,
+                text=self.state_text,
+                missing_readers=self.port.missing_readers(),
+                counters={**self.port.counters(), **self.node.diagnostics()},
+                resident_mb=resident_mb(),
+            ),
+            stamp_ns=self.clock.now_ns(),
+        )
+
+
+def resident_mb() -> float:
+    """Return this process's resident memory in MB."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * resource.getpagesize() / 1e6
+    except (OSError, ValueError, IndexError):
+        return 0.0

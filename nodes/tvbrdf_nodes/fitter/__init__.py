@@ -1,0 +1,1 @@
+"""The fitter: fits each scan as it arrives."""

@@ -1,0 +1,142 @@
+"""What the merger has of one sweep, until every device has said that its part has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from tvbrdf_messages.envelope import Envelope
+from tvbrdf_messages.messages import ArmState, SweepResult
+
+if TYPE_CHECKING:
+    from tvbrdf_fitting.calibration import Calibration
+    from tvbrdf_fitting.frame_reduction import PatchStatistics
+    from tvbrdf_fitting.scan_merge import FrameRecord, SweepObservations
+
+SweepKey = tuple[int, int, int]
+"""Scan, sweep, attempt."""
+
+
+class ReducedFrame(NamedTuple):
+    """A frame after its pixels were reduced; sorts by sequence, whenever it came."""
+
+    incarnation: str
+    sequence: int
+    exposure_ms: float
+    hardware_ns: int
+    received_ns: int
+    statistics: PatchStatistics
+
+
+@dataclass(slots=True)
+class Sweep:
+    """Frames by camera number, and who has ended its part how."""
+
+    frames: dict[int, list[ReducedFrame]] = field(default_factory=dict)
+    results: dict[str, SweepResult] = field(default_factory=dict)
+
+
+class SweepError(ValueError):
+    """A sweep that can't be used; the text says why, and it is taken again."""
+
+
+def check_complete(sweep: Sweep, cameras: Mapping[str, int]) -> None:
+    """Refuse a sweep of which frames are missing here."""
+    for name, number in cameras.items():
+        result, got = sweep.results[name], len(sweep.frames.get(number, ()))
+        if result.frames == 0:
+            raise SweepError(f"{name} saw no frame")
+        if got != result.frames:
+            raise SweepError(f"{name} sent {result.frames} frames, {got} arrived")
+
+
+def solve_arm(states: list[Envelope], result: SweepResult) -> tuple[Any, float, dict[str, float]]:
+    """Return the light's path in a sweep, the deviation of its stamps (ns), and its clock.
+
+    The states are those that the arm counted to the sweep, whenever they came.
+    """
+    from tvbrdf_fitting.clock_model import ClockError, fit_clock
+    from tvbrdf_fitting.light_path import LightPath
+
+    chosen = sorted(
+        {
+            envelope.header.sequence: envelope
+            for envelope in states
+            if result.first_sequence <= envelope.header.sequence <= result.last_sequence
+        }.items()
+    )
+    if len(chosen) != result.last_sequence - result.first_sequence + 1:
+        raise SweepError(f"{result.source}: states of the sweep are missing")
+    headers = [envelope.header for _, envelope in chosen]
+    arms = [m for _, e in chosen if isinstance(m := e.message, ArmState)]
+    delay_ns = arms[-1].one_way_delay_ns if arms else 0
+    try:
+        clock = fit_clock(
+            [header.hardware_ns for header in headers],
+            [header.received_ns - delay_ns for header in headers],
+        )
+        stamps = clock.to_run_ns([header.hardware_ns for header in headers])
+        path = LightPath.from_reports(
+            stamps,
+            [state.angle_deg for state in arms],
+            [state.speed_deg_s for state in arms],
+        )
+    except (ClockError, ValueError) as error:
+        raise SweepError(f"{result.source}: {error}") from error
+    middle = [headers[len(headers) // 2].hardware_ns]
+    # the two ways of a round trip may share it in any proportion: uniform, so 1/sqrt(3) of a half
+    std_ns = float((clock.std_ns(middle)[0] ** 2 + delay_ns**2 / 3.0) ** 0.5)
+    facts = {"drift_ppm": 1e6 * clock.drift, "jitter_ms": clock.jitter_ns / 1e6}
+    return path, std_ns, {**facts, "delay_ms": delay_ns / 1e6}
+
+
+def solve_sweep(
+    sweep: Sweep,
+    key: SweepKey,
+    dark: list[FrameRecord],
+    states: list[Envelope],
+    calibration: Calibration,
+    arm: str,
+) -> tuple[SweepObservations, dict[str, Any]]:
+    """Return a sweep's calibrated observations, and what was found about its clocks."""
+    from tvbrdf_fitting.clock_model import ClockError, frame_stamps
+    from tvbrdf_fitting.scan_merge import FrameRecord, sweep_observations
+
+    path, arm_std_ns, arm_facts = solve_arm(states, sweep.results[arm])
+    records: list[FrameRecord] = []
+    stds_ns: dict[int, float] = {}
+    facts: dict[str, Any] = {"arm": arm_facts}
+    for number, frames in sorted(sweep.frames.items()):
+        frames.sort(key=lambda frame: frame[:2])
+        try:
+            stamps = frame_stamps(
+                [frame.hardware_ns for frame in frames],
+                [frame.received_ns for frame in frames],
+                [frame.exposure_ms for frame in frames],
+                calibration.camera(number),
+            )
+        except ClockError as error:
+            raise SweepError(str(error)) from error
+        stds_ns[number] = float(stamps.std_ns[len(frames) // 2])
+        facts[f"camera {number}"] = {
+            "frames": len(frames),
+            "drift_ppm": 1e6 * stamps.clock.drift,
+            "jitter_ms": stamps.clock.jitter_ns / 1e6,
+        }
+        records += [
+            FrameRecord(number, key[1], frame.exposure_ms, int(stamp), frame.statistics)
+            for frame, stamp in zip(frames, stamps.stamp_ns.tolist(), strict=True)
+        ]
+    try:
+        observations = sweep_observations(
+            records,
+            dark,
+            path,
+            calibration,
+            camera_stamp_std_ns=stds_ns,
+            arm_stamp_std_ns=arm_std_ns,
+        )
+    except ValueError as error:
+        raise SweepError(str(error)) from error
+    return observations, {**facts, "dropped": dict(observations.dropped)}

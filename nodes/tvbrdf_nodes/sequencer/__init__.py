@@ -1,0 +1,1 @@
+"""The sequencer: decides what is measured when."""
