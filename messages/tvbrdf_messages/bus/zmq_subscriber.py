@@ -184,8 +184,9 @@ class ZmqSubscriber:
         return all(link.incarnation for link in self.links)
 
     def close(self) -> None:
-        """Close all sockets."""
-        for link in self.links:
+        """Close all sockets; closing twice does nothing."""
+        links, self.links = self.links, []
+        for link in links:
             link.socket.disable_monitor()
             link.monitor.close(linger=0)
             link.socket.close()

@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 
 from ..core.device import DeviceError, DriverContext, ReaderThread
 from .aravis_library import load_aravis
-from .driver import TRIGGER, CameraIdentity, CameraSettings, CaptureTag, RawFrame, Region
+from .driver import (
+    TRIGGER,
+    CameraIdentity,
+    CameraSettings,
+    CaptureTag,
+    RawFrame,
+    Region,
+    region_on,
+)
 
 PREFERRED_FORMATS = (
     "BayerRG12", "BayerGR12", "BayerGB12", "BayerBG12", "BGR8", "RGB8",
@@ -142,8 +150,8 @@ class AravisCamera:
         if self._reader is not None:
             raise DeviceError(f"{self._name}: settings can't change during a capture")
         camera, identity = self._open_camera(), self.identity
+        region = region_on(identity.width, identity.height, settings.region, self._name)
         with self._errors_of(f"can't set it to {settings}"):
-            region = settings.region or Region(0, 0, identity.width, identity.height)
             camera.set_region(*region)
             box = camera.get_region()
             exposure_us, rate = self._set_exposure(camera, settings)
@@ -181,6 +189,7 @@ class AravisCamera:
         with self._errors_of("can't start it"):
             payload = camera.get_payload()
             if self._stream is None or payload != self._payload:
+                self._stream = None  # of two streams the camera would serve the older one
                 self._stream, self._payload = camera.create_stream(None, None), payload
                 for _ in range(self._parameters.buffers):
                     self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from ..core.device import Driver
+from ..core.device import DeviceError, Driver
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,6 +29,24 @@ class Region(NamedTuple):
     y: int
     width: int
     height: int
+
+
+def region_on(width: int, height: int, wanted: Region | None, name: str) -> Region:
+    """Return the region that is wanted of a sensor; the whole one for None.
+
+    Raises
+    ------
+    DeviceError
+        If it does not lie on the sensor; the text has the camera's name.
+    """
+    region = wanted or Region(0, 0, width, height)
+    inside = region.x + region.width <= width and region.y + region.height <= height
+    if min(region.x, region.y) < 0 or min(region.width, region.height) < 1 or not inside:
+        raise DeviceError(
+            f"{name}: region {tuple(region)} (x, y, width, height) does not lie on its sensor of "
+            f"{width}x{height} pixels"
+        )
+    return region
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -361,7 +361,7 @@ class CameraNode(Node[CameraParameters]):
             bit_depth=self._driver.identity.bit_depth,
             region_x=region.x if region is not None else 0,
             region_y=region.y if region is not None else 0,
-            image=frame.image,  # type: ignore[arg-type]  # its schema allows float32 too
+            image=frame.image,
         )
         # outputs are published one by one, so this is the number that the frame will carry
         capture.sent(self.context.next_sequence(self._topic), frame.received_ns)

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..core.device import DeviceError, DriverContext, ReaderThread
-from .driver import TRIGGER, CameraIdentity, CameraSettings, CaptureTag, RawFrame, Region
+from .driver import TRIGGER, CameraIdentity, CameraSettings, CaptureTag, RawFrame, region_on
 
 MS_PER_V4L2_UNIT = 0.1
 _MANUAL_EXPOSURE = 1
@@ -126,17 +126,7 @@ class OpenCvCamera:
         if self._reader is not None:
             raise DeviceError(f"{self._name}: settings can't change during a capture")
         device, identity = self._open_device(), self.identity
-        region = settings.region or Region(0, 0, identity.width, identity.height)
-        if (
-            min(region.x, region.y) < 0
-            or min(region.width, region.height) < 1
-            or region.x + region.width > identity.width
-            or region.y + region.height > identity.height
-        ):
-            raise DeviceError(
-                f"{self._name}: region {tuple(region)} (x, y, width, height) does not lie on its "
-                f"{identity.width}x{identity.height} pixels"
-            )
+        region = region_on(identity.width, identity.height, settings.region, self._name)
         if self._is_file:
             exposure_ms = self._parameters.exposure_ms or settings.exposure_ms
         else:

@@ -20,7 +20,15 @@ from tvbrdf_messages.messages import SimGrant, SimHorizon, SimMotion, SimScene
 from ..core.device import DeviceError, DriverContext
 from ..core.node import TopicUse
 from ..world.scene import Scene, SceneError, scene_from_dict
-from .driver import TRIGGER, CameraIdentity, CameraSettings, CaptureTag, RawFrame, Region
+from .driver import (
+    TRIGGER,
+    CameraIdentity,
+    CameraSettings,
+    CaptureTag,
+    RawFrame,
+    Region,
+    region_on,
+)
 from .simulated_clock import CameraClock
 from .simulated_faults import FaultPlan
 from .simulated_image import REFERENCE, SAMPLE, Bands, ImageMaker, SimulatedCameraParameters
@@ -141,14 +149,8 @@ class SimulatedCamera:
 
     def _as_possible(self, settings: CameraSettings) -> CameraSettings:
         """Return the settings that the sensor can have nearest to those wanted."""
-        sensor = Region(0, 0, self._parameters.width, self._parameters.height)
-        region = settings.region or sensor
-        right, lower = region.x + region.width, region.y + region.height
-        if min(region) < 0 or min(region[2:]) < 1 or right > sensor.width or lower > sensor.height:
-            raise DeviceError(
-                f"{self._context.name}: region {tuple(region)} (x, y, width, height) does not lie "
-                f"on the sensor of {sensor.width}x{sensor.height} pixels"
-            )
+        width, height = self._parameters.width, self._parameters.height
+        region = region_on(width, height, settings.region, self._context.name)
         exposure_ms = max(round(settings.exposure_ms, 3), MIN_EXPOSURE_MS)
         rate = min(settings.frame_rate_hz, self._parameters.frame_rate_hz, 1e3 / exposure_ms)
         return replace(settings, exposure_ms=exposure_ms, frame_rate_hz=rate, region=region)

@@ -100,6 +100,7 @@ class NodeProcess:
             if self._wait_for_readers():
                 runner.set_state(READY)
                 runner.node.prepare()
+                self.port.events()  # of the registrations that were waited for
                 runner.set_state(RUNNING)
                 runner.put(runner.node.start())
                 gc.collect()

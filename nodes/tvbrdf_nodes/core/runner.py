@@ -144,13 +144,7 @@ class NodeRunner:
     def take_messages(self, limit: int = 64) -> bool:
         """Hand arrived messages and events to the node; say whether there were any."""
         found = self.port.receive(limit)
-        for envelope in found:
-            if envelope.topic == "/clock" and isinstance(envelope.message, Clock):
-                if isinstance(self.clock, ToldClock):
-                    self.clock.tell(envelope.message.now_ns, envelope.message.epoch)
-                continue
-            self.put(self.node.handle(envelope))
-        events = self.port.events()
+        events = self.port.events()  # first: what a restarted node sends comes after its return
         for event in events:
             if event.kind == "refused":
                 self.log.warning(f"refused from {event.name}: {event.text}")
@@ -161,6 +155,12 @@ class NodeRunner:
                     "found": self.node.on_found,
                 }[event.kind]
                 self.put(handler(event.name))
+        for envelope in found:
+            if envelope.topic == "/clock" and isinstance(envelope.message, Clock):
+                if isinstance(self.clock, ToldClock):
+                    self.clock.tell(envelope.message.now_ns, envelope.message.epoch)
+                continue
+            self.put(self.node.handle(envelope))
         return bool(found or events)
 
     def put(self, outputs: Outputs) -> None:

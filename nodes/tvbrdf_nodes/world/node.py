@@ -114,9 +114,9 @@ class WorldNode(Node[WorldParameters]):
         yield Send(topic="/clock", message=Clock(now_ns=now_ns, speedup=self.parameters.speedup))
         yield Send(topic="/sim/grant", message=SimGrant(until_ns=self._granted_ns))
 
-    def on_reader(self, reader: str) -> Outputs:
-        """A restarted device gets scene and grant again (both are latched)."""
-        self._horizons.pop(reader, None)
+    def on_lost(self, publisher: str) -> Outputs:
+        """Wait for a device that died: its successor gets the scene and the last grant again."""
+        self._horizons.pop(publisher, None)
         return ()
 
 

@@ -1,0 +1,1 @@
+"""Launch files, the launcher and the command line."""

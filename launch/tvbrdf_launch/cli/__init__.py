@@ -1,0 +1,75 @@
+"""The command ``tvbrdf``: one file a verb, each with ``add_parser`` and ``run``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+from . import arm, doctor, launch, mark, node, preview, report, samples, scan, stop, topic
+
+VERBS = (launch, stop, topic, node, arm, scan, preview, mark, report, samples, doctor)
+EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole command line."""
+    root = argparse.ArgumentParser(
+        prog="tvbrdf",
+        description="Measures how a material's reflectance changes with time.",
+        epilog="tvbrdf VERB --help tells more of each.",
+    )
+    root.add_argument("--version", action="store_true", help="print the version and end")
+    verbs = root.add_subparsers(title="verbs", metavar="VERB", dest="verb")
+    for verb in VERBS:
+        verb.add_parser(verbs)
+    return root
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb; return the exit status: 0, 1 (an error, told in one line), 2 (usage)."""
+    root = parser()
+    arguments, rest = root.parse_known_args(argv)
+    if rest and arguments.verb == "launch" and all(":=" in word for word in rest):
+        arguments.arguments += rest  # key:=value words may stand after options
+    elif rest:
+        root.error(f"unrecognized arguments: {' '.join(rest)}")
+    if arguments.version:
+        from ..run_folder import installed_version
+
+        print(installed_version())
+        return 0
+    if arguments.verb is None:
+        root.print_help()
+        return 0
+    try:
+        status = int(arguments.run(arguments))
+        sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # the reader has gone; nothing may be written at exit either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_ERROR
+    except Exception as error:
+        text = _explain(error)
+        if text is None:
+            raise
+        sys.stderr.write(f"tvbrdf: error: {text}\n")
+        return EXIT_ERROR
+
+
+def _explain(error: Exception) -> str | None:
+    """Return an expected error in one line; None for one that is a fault of this program."""
+    from tvbrdf_messages.errors import BusError
+
+    from ..errors import LaunchError, RunError
+
+    if isinstance(error, (LaunchError, RunError, BusError)):
+        return str(error)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}"
+    return None
