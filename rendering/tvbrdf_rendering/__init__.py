@@ -1,1 +1,5 @@
-"""Tables and pictures of what was measured: ``report.make_report`` writes them all."""
+"""Pictures of what was measured."""
+
+from .report import make_report
+
+__all__ = ["make_report"]

@@ -129,7 +129,7 @@ def mutate(change: Any) -> list[bytes]:
     [
         (lambda body: body[1].pop(), "fields missing: region_y"),
         (lambda body: body[1].__setitem__(3, "one"), "field scan holds 'one'"),
-        (lambda body: body[0].pop(), "no header"),
+        (lambda body: body[0].pop(), "header holds"),
         (lambda body: body[0].__setitem__(4, "x"), "header holds"),
         (lambda body: body[2][0].__setitem__(1, [2, 300, 3]), "18 bytes, dtype and shape say"),
         (lambda body: body[2][0].__setitem__(1, [2, -3, 3]), "shape is"),

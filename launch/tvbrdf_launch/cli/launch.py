@@ -43,7 +43,14 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     if arguments.show_args:
         return _show_arguments(arguments.file, arguments.json)
-    return _launch(arguments)
+    return launch(
+        arguments.file,
+        arguments.arguments,
+        run_directory=arguments.run_directory,
+        check=arguments.check,
+        plain=arguments.plain,
+        as_json=arguments.json,
+    )
 
 
 def _list(as_json: bool) -> int:
@@ -87,29 +94,39 @@ def _show_arguments(file: str, as_json: bool) -> int:
     return 0
 
 
-def _launch(arguments: argparse.Namespace) -> int:
+def launch(
+    file: str,
+    words: list[str],
+    *,
+    run_directory: str | None = None,
+    check: bool = False,
+    plain: bool = False,
+    as_json: bool = False,
+) -> int:
+    """Launch a file with ``key:=value`` words; return the exit status."""
     from ..arguments import parse_assignments
     from ..find_files import find_launch_file
     from ..launch_file import load_launch_file
     from ..plan import make_plan
     from ..run_folder import RunFolder, choose_run_directory
 
-    given = parse_assignments(arguments.arguments)
-    run_directory = choose_run_directory(arguments.run_directory)
-    launch = load_launch_file(find_launch_file(arguments.file), given, run_directory)
-    plan = make_plan(launch, run_directory)
-    if arguments.check:
+    given = parse_assignments(words)
+    directory = choose_run_directory(run_directory)
+    described = load_launch_file(find_launch_file(file), given, directory)
+    plan = make_plan(described, directory)
+    if check:
         names = [node.name for node in plan.nodes]
-        resolved = {"file": str(launch.path), "arguments": dict(launch.arguments), "nodes": names}
-        if arguments.json:
-            print_json(resolved)
+        settings = dict(described.arguments)
+        if as_json:
+            print_json({"file": str(described.path), "arguments": settings, "nodes": names})
         else:
-            print(f"{launch.path}: good; {len(names)} nodes: {', '.join(names)}")
+            print(f"{described.path}: good; {len(names)} nodes: {', '.join(names)}")
         return 0
     from ..launcher import Launcher
+    from ..truth import write_truth
 
     def make_display() -> Display:
-        if arguments.plain or not sys.stdout.isatty():
+        if plain or not sys.stdout.isatty():
             from ..display import Display
 
             return Display(plan.graph.simulated)
@@ -117,4 +134,7 @@ def _launch(arguments: argparse.Namespace) -> int:
 
         return TerminalDisplay(plan.graph.simulated)
 
-    return Launcher(plan, RunFolder(run_directory), make_display).run()
+    status = Launcher(plan, RunFolder(directory), make_display).run()
+    if plan.graph.simulated:
+        write_truth(plan.graph)
+    return status

@@ -39,7 +39,11 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_run_option(parser)
     parser.add_argument(
-        "--out", type=Path, default=Path("out/preview"), metavar="DIR", help="for PNG and OpenEXR files"
+        "--out",
+        type=Path,
+        default=Path("out/preview"),
+        metavar="DIR",
+        help="for PNG and OpenEXR files",
     )
     add_json_option(parser)
     add_timeout_option(parser, 60.0)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tvbrdf_messages.envelope import Envelope
-from tvbrdf_messages.messages import CameraInfo, Frame, ScanCommand
+from tvbrdf_messages.messages import CameraInfo, ScanCommand
 from tvbrdf_messages.topics import frame_topic, info_topic
 
 from ..core.commands import CommandGate
@@ -23,7 +23,14 @@ from ..core.node import Node, NodeContext, Outputs, Send, TopicUse
 from ..core.parameters import ParameterError, build
 from .capture import DARK, LIGHT, SETTLING, STILL, Capture
 from .driver import FREE_RUN, TRIGGER, CameraDriver, CameraSettings, RawFrame, Region
-from .reports import answer, camera_info, differ, unfit_for_scans, wrong_exposure
+from .reports import (
+    answer,
+    camera_info,
+    differ,
+    frame_message,
+    unfit_for_scans,
+    wrong_exposure,
+)
 
 ARM_ACTIONS = ("home", "lamp", "jog")
 FIRST_EXPOSURE_MS = 4.0
@@ -347,21 +354,14 @@ class CameraNode(Node[CameraParameters]):
         return trouble == "dropped"
 
     def _frame(self, capture: Capture, frame: RawFrame) -> Send:
-        command, settings = capture.command, self._settings
-        region = settings.region if settings is not None else None
-        message = Frame(
-            camera=self.context.name,
-            kind=capture.kind,
-            sample=command.sample,
-            scan=command.scan,
-            sweep=command.sweep,
-            attempt=command.attempt,
-            index=capture.frames,
-            exposure_ms=frame.exposure_ms,
-            bit_depth=self._driver.identity.bit_depth,
-            region_x=region.x if region is not None else 0,
-            region_y=region.y if region is not None else 0,
-            image=frame.image,
+        message = frame_message(
+            self.context.name,
+            capture.command,
+            capture.kind,
+            capture.frames,
+            frame,
+            self._driver.identity,
+            self._settings,
         )
         # outputs are published one by one, so this is the number that the frame will carry
         capture.sent(self.context.next_sequence(self._topic), frame.received_ns)

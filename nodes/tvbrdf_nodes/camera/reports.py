@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from tvbrdf_messages.messages import CameraInfo, ScanCommand, SweepResult
+from tvbrdf_messages.messages import CameraInfo, Frame, ScanCommand, SweepResult
 
-from .driver import CameraIdentity, CameraSettings, Region
+from .driver import CameraIdentity, CameraSettings, RawFrame, Region
 
 EXPOSURE_TOLERANCE = 0.01
 """Relative difference of an exposure as read back from the one that was asked for."""
@@ -54,6 +54,33 @@ def camera_info(name: str, identity: CameraIdentity, settings: CameraSettings) -
         hardware_stamps=identity.hardware_stamps,
         exact_exposure=identity.exact_exposure,
         frame_rate_hz=settings.frame_rate_hz,
+    )
+
+
+def frame_message(
+    name: str,
+    command: ScanCommand,
+    kind: str,
+    index: int,
+    frame: RawFrame,
+    identity: CameraIdentity,
+    settings: CameraSettings | None,
+) -> Frame:
+    """Return the message that carries a frame, taken for ``command`` as its ``index``-th."""
+    region = settings.region if settings is not None else None
+    return Frame(
+        camera=name,
+        kind=kind,
+        sample=command.sample,
+        scan=command.scan,
+        sweep=command.sweep,
+        attempt=command.attempt,
+        index=index,
+        exposure_ms=frame.exposure_ms,
+        bit_depth=identity.bit_depth,
+        region_x=region.x if region is not None else 0,
+        region_y=region.y if region is not None else 0,
+        image=frame.image,
     )
 
 

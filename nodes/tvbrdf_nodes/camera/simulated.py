@@ -43,7 +43,9 @@ if TYPE_CHECKING:
 
 BATCH = 4
 """Frames rendered in one call of read()."""
-MIN_EXPOSURE_MS = 0.01
+MIN_EXPOSURE_MS, MAX_EXPOSURE_MS = 0.01, 10_000.0
+KEEP_NS = round(2e6 * MAX_EXPOSURE_MS)
+"""How long the light's motion is remembered."""
 
 
 class _Planned(NamedTuple):
@@ -151,7 +153,7 @@ class SimulatedCamera:
         """Return the settings that the sensor can have nearest to those wanted."""
         width, height = self._parameters.width, self._parameters.height
         region = region_on(width, height, settings.region, self._context.name)
-        exposure_ms = max(round(settings.exposure_ms, 3), MIN_EXPOSURE_MS)
+        exposure_ms = min(max(round(settings.exposure_ms, 3), MIN_EXPOSURE_MS), MAX_EXPOSURE_MS)
         rate = min(settings.frame_rate_hz, self._parameters.frame_rate_hz, 1e3 / exposure_ms)
         return replace(settings, exposure_ms=exposure_ms, frame_rate_hz=rate, region=region)
 
@@ -245,6 +247,9 @@ class SimulatedCamera:
 
     def _tell_horizon(self) -> None:
         self._horizon_ns = self._granted_ns
+        if self._world is not None:
+            # exposures may have begun before, but not by more than the longest one
+            self._world.light.forget(self._horizon_ns - KEEP_NS)
         if self._link is not None:
             self._link.publish(
                 "/sim/horizon",

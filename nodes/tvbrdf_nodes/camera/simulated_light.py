@@ -15,9 +15,6 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-KEEP_NS = 10_000_000_000
-"""Motion older than this, seen from where it is final, is forgotten."""
-
 
 class SimulatedLight:
     """Angle and brightness of the light over the run's clock.
@@ -53,7 +50,10 @@ class SimulatedLight:
             self._starts = np.concatenate([self._starts[:kept], starts])
             self._pieces = np.concatenate([self._pieces[:kept], pieces])
             self._warm(kept)
-        old = int(np.searchsorted(self._starts, self.until_ns - KEEP_NS, side="right")) - 1
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the motion of before a moment that nobody asks for any more."""
+        old = int(np.searchsorted(self._starts, before_ns, side="right")) - 1
         if old > 0:
             self._starts, self._pieces = self._starts[old:], self._pieces[old:]
 

@@ -83,12 +83,20 @@ class SimulatedView:
         Returns
         -------
         array (n, 2, 3): sample and reference piece, B, G, R
+
+        Raises
+        ------
+        DeviceError
+            If a file of a measured sample can't be read.
         """
         angle_deg, brightness = self._light_during(middle_ns, exposure_ns)
         shape = (*angle_deg.shape, 3)
         angles = angle_deg.ravel()
         radiance = np.empty((angles.size, 2, 3))
-        radiance[:, 0] = self._of_sample(tag, angles, np.repeat(middle_ns, self._nodes.size))
+        try:
+            radiance[:, 0] = self._of_sample(tag, angles, np.repeat(middle_ns, self._nodes.size))
+        except SampleError as error:
+            raise DeviceError(f"scene: {error}") from error
         cosine = np.cos(np.deg2rad(angles - TILT_DEG))
         radiance[:, 1] = REFERENCE_ALBEDO * np.maximum(cosine, 0.0)[:, None]
         if self._hidden:
