@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,6 +24,10 @@ from .uncertainty import (
     undetermined,
 )
 
+MISFIT = 4.0
+"""Chi-square by degrees of freedom above which a model can't explain the data."""
+MISFIT_ROUNDS, MISFIT_AGREEMENT = 6, 0.02
+
 
 def fit_scan(
     observations: Observations,
@@ -32,8 +37,14 @@ def fit_scan(
     fixed: Mapping[str, float] | None = None,
     initial: Mapping[str, float] | None = None,
     common_errors: CommonErrors | None = None,
+    model_error: bool = True,
 ) -> FitResult:
     """Fit a model to one scan, weighted by the stated variances.
+
+    Where the model can't explain the data within their noise (`chi_square` a few times the degrees
+    of freedom), noise alone would let the many precise, dark values decide everything and a peak
+    be missed. Then the model's own error, one standard deviation of radiance for all values, is
+    estimated from the residuals and added to the variances, until both agree.
 
     Parameters
     ----------
@@ -50,6 +61,8 @@ def fit_scan(
         Published values to start from, by name, instead of the search's; one start then.
     common_errors
         Errors that frames share; adds `covariance_common`.
+    model_error
+        False: weigh by the stated variances whatever the misfit.
 
     Raises
     ------
@@ -65,7 +78,33 @@ def fit_scan(
         raise FitError(f"unknown method {method!r}; known methods: {', '.join(SOLVERS)}")
     problem = make_problem(observations, chosen, fixed or {}, initial or {})
     solution = SOLVERS[method](problem)
-    return _result(observations, problem, solution, common_errors, began)
+    misfit = 0.0
+    noise_only = problem
+    if model_error and 2 * problem.cost(solution.internal) > MISFIT * problem.degrees_of_freedom:
+        problem, solution, misfit = _fit_with_model_error(problem, solution, SOLVERS[method])
+    chi_square = 2 * noise_only.cost(solution.internal)
+    return _result(observations, problem, solution, common_errors, misfit, chi_square, began)
+
+
+def _fit_with_model_error(
+    problem: Problem, solution: Solution, solve: Solver
+) -> tuple[Problem, Solution, float]:
+    """Add the residuals' spread to the variances and fit again, until the two agree."""
+    weighted = problem.weight > 0
+    variance = np.zeros(problem.weight.shape)
+    variance[weighted] = problem.weight[weighted] ** -2
+    spread = 0.0
+    current = problem
+    for _ in range(MISFIT_ROUNDS):
+        residual = (problem.predict(solution.internal) - problem.radiance)[weighted]
+        before, spread = spread, float(np.sqrt(np.mean(residual**2)))
+        if abs(spread - before) <= MISFIT_AGREEMENT * spread:
+            break
+        weight = np.zeros(problem.weight.shape)
+        weight[weighted] = 1.0 / np.sqrt(variance[weighted] + spread**2)
+        current = replace(problem, weight=weight)
+        solution = solve(current)
+    return current, solution, spread
 
 
 def _result(
@@ -73,6 +112,8 @@ def _result(
     problem: Problem,
     solution: Solution,
     common_errors: CommonErrors | None,
+    misfit: float,
+    chi_square: float,
     began: float,
 ) -> FitResult:
     model, internal = problem.model, solution.internal
@@ -83,7 +124,6 @@ def _result(
         i for i in range(len(model.parameters)) if i not in problem.free and i not in problem.fixed
     ]
     values, internal = model.to_published(internal), internal.copy()
-    residual = problem.residual(internal)
     errors = measure_errors(observations, _whole_prediction(observations, problem, internal))
     scale = published_scale(problem, internal, uncertainty)
     random = to_published(uncertainty.random, scale)
@@ -101,8 +141,9 @@ def _result(
         undetermined=tuple(names[i] for i in lost),
         fixed=tuple(names[i] for i in sorted(problem.fixed)),
         errors=errors,
-        chi_square=float(residual @ residual),
-        degrees_of_freedom=problem.value_count - len(problem.free),
+        chi_square=chi_square,
+        degrees_of_freedom=problem.degrees_of_freedom,
+        model_error_std=misfit,
         solver=solution.solver,
         reason=solution.reason,
         evaluations=solution.evaluations,

@@ -97,7 +97,12 @@ class FrameReducer:
 
     def _highest_code(self, image: NDArray[Any]) -> int:
         number = self._camera.camera
-        if image.dtype not in self._dtypes or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        if (
+            image.dtype not in self._dtypes
+            or image.ndim != 3
+            or image.shape[2] != 3
+            or image.size == 0
+        ):
             raise ValueError(
                 f"camera {number}: frame is {image.dtype} of shape {image.shape}; a camera of "
                 f"{self._camera.bit_depth} bits gives {self._dtype} of shape (height, width, 3): "

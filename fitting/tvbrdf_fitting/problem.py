@@ -63,6 +63,11 @@ class Problem:
         """Number of values with a weight."""
         return int(np.count_nonzero(self.weight))
 
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Number of values less that of free coordinates."""
+        return self.value_count - len(self.free)
+
     def predict(self, internal: FloatArray) -> FloatArray:
         """Radiance (3, n) of the model at internal coordinates (p,)."""
         value = self.model.value(self.prepared, internal) * self.to_radiance

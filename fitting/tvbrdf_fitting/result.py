@@ -29,9 +29,9 @@ class FitResult:
     covariance_random, covariance_common
         (p, p) from the errors of each value, and from errors that frames share (0 unless they were
         stated). NaN for parameters the data say nothing of. sigma_d near 0 has a deviation that
-        covers the interval of sigma_d^2 (`uncertainty.published_scale`). Not rescaled by
-        chi-square: where `chi_square / degrees_of_freedom` is far above 1, the model or the stated
-        noise is wrong, and so are these.
+        covers the interval of sigma_d^2 (`uncertainty.published_scale`). With
+        `model_error_std` above 0 they belong to a model that is wrong: they say how well its best
+        values are defined, not how near the truth they are.
     at_bound
         Names of the free parameters that ended at a bound; deviations there are one-sided at best.
     undetermined
@@ -40,6 +40,9 @@ class FitResult:
         Names of the parameters that were given.
     errors
         Error measures over the usable observations.
+    model_error_std
+        Standard deviation of radiance that was added to the noise because the model can't explain
+        the data without; 0 where it can. The chi-square is without it.
     chi_square, degrees_of_freedom
         Sum of squared weighted residuals, and values less free parameters.
     solver, reason, evaluations
@@ -62,6 +65,7 @@ class FitResult:
     errors: ErrorMeasures
     chi_square: float
     degrees_of_freedom: int
+    model_error_std: float
     solver: str
     reason: str
     evaluations: int
@@ -124,6 +128,7 @@ class FitResult:
             "errors": self.errors.as_dict(),
             "chi_square": _plain(self.chi_square),
             "degrees_of_freedom": self.degrees_of_freedom,
+            "model_error_std": self.model_error_std,
             "solver": self.solver,
             "reason": self.reason,
             "evaluations": self.evaluations,

@@ -191,6 +191,8 @@ class Parameters(Message):
     """All error measures, by name."""
     chi_square: float
     degrees_of_freedom: int
+    model_error_std: float
+    """Of radiance, added to the noise because the model can't explain the data without."""
     reason: str
     """Why the solver stopped."""
     solver: str

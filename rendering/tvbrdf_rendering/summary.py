@@ -28,6 +28,7 @@ ERROR_HEADINGS = {
     "mean": "mean",
     "count": "values",
     "chi_square_per_degree": "chi2/dof",
+    "model_error_std": "model err",
     "log_count": "in log",
     "log_dropped_grazing": "-grazing",
     "log_dropped_measured": "-dark",
@@ -45,7 +46,9 @@ Parameters: published units (sigma_d and sigma_s in radians), channels b g r;
 Errors: of the radiance pi BRDF cos(theta_i), all cameras, lights and channels. RMS/peak: by the
   scan's largest value; RMS/mean: by its mean; RMS log: of ln(fit / measured), over values > 1e-4
   and angles < 80 degrees only; -grazing, -dark, -dark fit: values that it left out.
-  chi2/dof: weighted by the stated noise; far above 1, the model or the noise is wrong.
+  chi2/dof: weighted by the stated noise; far above 1, the model or the noise is wrong. model err:
+  standard deviation that was added to the noise of each value because the model can't explain
+  the data without; deviations of parameters then say how well its best values are defined.
 """
 
 

@@ -125,6 +125,25 @@ def test_real_materials_fit_as_well_as_elsewhere(
     assert "sigma_d" in result.at_bound
 
 
+def test_a_model_that_cannot_explain_the_data_fits_them_all_alike(
+    real_material: Callable[[str], Observations],
+) -> None:
+    """Noise that follows the signal must not make a fit miss the peak of a real material."""
+    measured = real_material("satin_rosaline")
+    plain_fit = fit_scan(measured)
+    noisy = replace(measured, variance=(1e-3 * measured.radiance) ** 2 + 1e-10)
+    careful, naive = fit_scan(noisy), fit_scan(noisy, model_error=False)
+    assert careful.model_error_std == pytest.approx(plain_fit.errors.rms_absolute, rel=0.05)
+    assert careful.errors.rms_percent < 1.02 * plain_fit.errors.rms_percent
+    assert naive.errors.rms_percent > 1.5 * plain_fit.errors.rms_percent
+    assert naive.model_error_std == 0.0
+
+
+def test_a_model_that_explains_the_data_is_given_no_error(simulate: Simulate) -> None:
+    result = fit_scan(simulate([0.1, 0.2, 0.6, 0.3, 0.4, 6.0], noise=0.01, seed=3, step=8))
+    assert result.model_error_std == 0.0
+
+
 def test_global_minimum_of_random_scenes(simulate: Simulate) -> None:
     """Within 1e-6 of the cost of a multi-start trust region, on determined and dull scenes."""
     rng = np.random.default_rng(11)
@@ -137,7 +156,7 @@ def test_global_minimum_of_random_scenes(simulate: Simulate) -> None:
         ]
         gains = 1 + 0.02 * rng.normal(size=(4, 3)) * (seed % 2)
         observations = simulate(truth, noise=0.01, seed=seed, step=8, gains=gains)
-        result = plain(fit_scan(observations))
+        result = plain(fit_scan(observations, model_error=False))
         problem = make_problem(observations, get_model("ON+TS"), {}, {})
         best = problem.cost(solve_trust_region(problem).internal)
         assert 0.5 * result.chi_square <= best * (1 + 1e-6)

@@ -44,8 +44,8 @@ class SimulatedCameraParameters:
     """Of the sensor, pixels."""
     height: int = 128
     bit_depth: int = 12
-    frame_rate_hz: float = 30.0
-    """Highest rate."""
+    frame_rate_hz: float = 120.0
+    """Highest rate that the sensor can have; the node's own parameter sets the rate."""
     black_level_dn: float = 64.0
     """Of 12 bits; scaled with the depth."""
     full_well_e: float = 10_000.0

@@ -243,6 +243,7 @@ def fit_record(parameters: Parameters) -> FitRecord:
             **parameters.errors,
             "chi_square": parameters.chi_square,
             "degrees_of_freedom": parameters.degrees_of_freedom,
+            "model_error_std": parameters.model_error_std,
         },
         solver=parameters.solver,
         reason=parameters.reason,
