@@ -42,8 +42,8 @@ class Port(Protocol):
 
         With ``keep``, it is kept under that key and sent again to a restarted reader until
         :meth:`release`. Small lossless messages may wait to travel together until the port is
-        serviced, which its owner does before it waits for anything. Waits for credit on a lossless topic; a live source does not wait: then
-        ``False`` says that a reader did not get it.
+        serviced, which its owner does before it waits for anything. Waits for credit on a lossless
+        topic; a live source does not wait: then ``False`` says that a reader did not get it.
         """
         ...
 

@@ -13,7 +13,7 @@ from ..errors import StoppedError
 from ..run_directory import Graph
 from ..schema import Message
 from .port import PortEvent
-from .zmq_publisher import ZmqPublisher
+from .zmq_publisher import Ready, ZmqPublisher
 from .zmq_subscriber import DEFAULT_CREDIT_BYTES, ZmqSubscriber
 
 WAIT_MS = 100
@@ -46,8 +46,8 @@ class ZmqPort:
     ) -> None:
         self.name = name
         self.incarnation = new_incarnation()
-        self.waited_ns = 0
         self._stopping = stopping
+        self._ready: Ready = None
         for channel in ("lossless", "latest"):
             # a socket file outlives a killed process; the launcher starts one process a name
             Path(graph.endpoint(name, channel).removeprefix("ipc://")).unlink(missing_ok=True)
@@ -85,12 +85,22 @@ class ZmqPort:
 
     def receive(self, limit: int = 64) -> list[Envelope]:
         """See :meth:`.port.Port.receive`."""
-        return self.subscriber.receive(limit)
+        ready, self._ready = self._ready, None
+        return self.subscriber.receive(limit, ready)
 
-    def service(self) -> None:
-        """Handle registrations, credit and lost connections; never blocks."""
-        self.subscriber.service()
-        self.publisher.service()
+    def service(self, ready: Ready = None) -> None:
+        """Handle registrations, credit and lost connections; never blocks.
+
+        With the sockets that a poll of :meth:`sockets` found ``ready``, the others are not asked,
+        also not by the next :meth:`receive`.
+        """
+        self._ready = ready
+        self.subscriber.service(ready)
+        self.publisher.service(ready)
+
+    def flush(self) -> None:
+        """Send small messages that wait to travel together; do it before waiting for anything."""
+        self.publisher.flush()
 
     def events(self) -> list[PortEvent]:
         """See :meth:`.port.Port.events`."""

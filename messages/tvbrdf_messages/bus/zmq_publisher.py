@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Any
 
 import msgpack
@@ -17,8 +17,8 @@ from ..schema import Message
 from ..topics import LATEST, LOSSLESS, Topic, find_topic
 from .port import PortEvent
 
-ZERO_COPY_BYTES = 65536
-"""Below this a copy is faster than sharing the buffer."""
+ZERO_COPY_BYTES = 262144
+"""Below this a copy is faster than sharing the buffer, which a thread must be told to free."""
 TOGETHER_BYTES = 16384
 """Small lossless messages wait for each other up to this size, or until :meth:`flush`."""
 COMMAND_CREDIT_BYTES = 8 << 20
@@ -27,6 +27,10 @@ WATCH_QUEUE_BYTES = 16 << 20
 """What may wait for a slow watcher; older messages are dropped for it."""
 _BROKEN = (ValueError, KeyError, TypeError, AttributeError, msgpack.UnpackException)
 HELLO, CREDIT, WELCOME, REFUSED = b"!HELLO", b"!CREDIT", b"!WELCOME", b"!REFUSED"
+
+
+Ready = Container[Any] | None
+"""The sockets that a poll found readable; None: nobody polled, so each is asked."""
 
 
 def readable(socket: zmq.Socket[bytes]) -> bool:
@@ -219,11 +223,14 @@ class ZmqPublisher:
 
     # -- what readers and watchers say
 
-    def service(self) -> None:
+    def service(self, ready: Ready = None) -> None:
         """Take registrations, credit and watchers' subscriptions that have arrived."""
         self.flush()
-        while readable(self.watch):
-            self._take_subscription(self.watch.recv(zmq.DONTWAIT))
+        if ready is None or self.watch in ready:
+            while readable(self.watch):
+                self._take_subscription(self.watch.recv(zmq.DONTWAIT))
+        if ready is not None and self.router not in ready:
+            return
         while readable(self.router):
             parts = self.router.recv_multipart(zmq.DONTWAIT)
             try:
@@ -237,6 +244,13 @@ class ZmqPublisher:
             ) as bad:
                 self.refused += 1
                 self.events.append(PortEvent("refused", "unknown", text=f"{bad!s:.200}"))
+            except zmq.ZMQError as error:
+                if error.errno not in (zmq.EHOSTUNREACH, zmq.EAGAIN):
+                    raise
+                # it died between its registration and the answer; wait for its successor
+                gone = [name for name, r in self._readers.items() if r.identity == parts[0]]
+                for name in gone:
+                    del self._readers[name]
 
     def _take_subscription(self, raw: bytes) -> None:
         if not raw or raw[0] not in (0, 1):

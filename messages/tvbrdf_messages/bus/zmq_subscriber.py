@@ -14,7 +14,7 @@ from ..errors import MessageError
 from ..run_directory import Graph
 from ..topics import LATEST, LOSSLESS, find_topic
 from .port import PortEvent
-from .zmq_publisher import CREDIT, HELLO, MESSAGE_OVERHEAD_BYTES, REFUSED, WELCOME, readable
+from .zmq_publisher import CREDIT, HELLO, MESSAGE_OVERHEAD_BYTES, REFUSED, WELCOME, Ready, readable
 
 DEFAULT_CREDIT_BYTES = 64 << 20
 RECONNECT_MS = 5
@@ -97,10 +97,10 @@ class ZmqSubscriber:
         found = [s for link in self.links for s in (link.socket, link.monitor)]
         return [*found, self.latest] if self.latest is not None else found
 
-    def service(self) -> None:
+    def service(self, ready: Ready = None) -> None:
         """Register where a connection was made; notice where one was lost."""
         for link in self.links:
-            while readable(link.monitor):
+            while (ready is None or link.monitor in ready) and readable(link.monitor):
                 event = parse_monitor_message(link.monitor.recv_multipart(zmq.DONTWAIT))
                 if event["event"] == zmq.EVENT_CONNECTED:
                     self._say_hello(link)
@@ -119,18 +119,21 @@ class ZmqSubscriber:
         }
         link.socket.send_multipart([HELLO, msgpack.packb(hello)], zmq.DONTWAIT)
 
-    def receive(self, limit: int) -> list[Envelope]:
+    def receive(self, limit: int, ready: Ready = None) -> list[Envelope]:
         """Return up to about ``limit`` messages; those of the call before count as handled."""
         found, self._early = self._early, []
         for link in self.links:
             link.handled[0] += link.taken[0]
             link.handled[1] += link.taken[1]
             link.taken = [0, 0]
-            while len(found) < limit and readable(link.socket):
-                self._receive_one(link, found)
+            if ready is None or link.socket in ready:
+                while len(found) < limit and readable(link.socket):
+                    self._receive_one(link, found)
             link.give_credit()
-        while self.latest is not None and len(found) < limit and readable(self.latest):
-            self._decode(_receive_parts(self.latest), found)
+        latest = self.latest
+        if latest is not None and (ready is None or latest in ready):
+            while len(found) < limit and readable(latest):
+                self._decode(_receive_parts(latest), found)
         return found
 
     def _receive_one(self, link: _Link, found: list[Envelope]) -> None:

@@ -18,7 +18,6 @@ from tvbrdf_messages.run_directory import Graph
 
 from .runner import READY, RUNNING, STOPPING, NodeRunner
 
-
 LONGEST_WAIT_S = 0.05
 
 

@@ -145,7 +145,7 @@ class NodeProcess:
             if self._signalled:
                 self._signalled = False
                 runner.put(getattr(node, "on_signal", tuple)())
-            port.service()
+            port.service(ready)
             runner.take_messages()
             runner.put(node.poll())
             runner.fire_timers()
@@ -154,6 +154,7 @@ class NodeProcess:
             if now >= next_diagnostics:
                 next_diagnostics = now + DIAGNOSTICS_S
                 runner.tell_diagnostics()
+            port.flush()
 
     def _timeout_ms(self, next_diagnostics: float) -> int:
         runner = self.runner
