@@ -27,6 +27,8 @@ class Seen:
     """Messages of a run with the monotonic time (s) at which a watcher got them."""
 
     launched_s: float = 0.0
+    graph_s: float = 0.0
+    """When the graph was written, just before the processes are started."""
     first_frame_s: float = 0.0
     commands: list[tuple[float, ScanCommand]] = field(default_factory=list)
     results: list[tuple[float, SweepResult]] = field(default_factory=list)
@@ -70,9 +72,7 @@ class Seen:
 
     def counters(self, name: str) -> dict[str, int]:
         """Return a counter of each node, as last told."""
-        return {
-            d.node: int(d.counters[name]) for _, d in self.diagnostics if name in d.counters
-        }
+        return {d.node: int(d.counters[name]) for _, d in self.diagnostics if name in d.counters}
 
 
 @contextlib.contextmanager
@@ -104,6 +104,7 @@ def run_rig(watch_frames: bool = False, limit_s: float = 600.0, **arguments: Any
             graph_file = Path(directory) / "r" / "graph.json"
             while not graph_file.exists() and process.poll() is None:
                 time.sleep(0.001)
+            seen.graph_s = time.monotonic()
             topics = [*TOPICS, *(["/camera_1/frame"] if watch_frames else [])]
             with Watcher(read_graph(graph_file.parent), topics) as watcher:
                 deadline = time.monotonic() + limit_s
