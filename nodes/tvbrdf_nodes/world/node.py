@@ -32,7 +32,7 @@ class WorldParameters:
     """Cap while nothing moves, so that people and nodes can follow."""
     moving_speedup: float = 10.0
     """Cap while the arm moves but not all cameras watch: commands are on their way."""
-    step_ms: float = 100.0
+    step_ms: float = 250.0
     """How far simulated devices may go ahead of the slowest."""
 
     def __post_init__(self) -> None:
