@@ -18,13 +18,12 @@ from tvbrdf_messages.messages import (
     OperatorRequest,
     ScanCommand,
     ScanMissing,
-    ScanStatus,
     Stored,
     SweepResult,
 )
 
 from ..core.node import Exit, Node, NodeContext, Output, Outputs, Release, Reply, Send, TopicUse
-from .plan import Scan, SequencerParameters
+from .plan import Scan, SequencerParameters, progress
 
 MERGER = "hdr_merger"
 WRITER = "database_writer"
@@ -393,21 +392,8 @@ class SequencerNode(Node[SequencerParameters]):
         if answers:
             limit_s = self.parameters.answer_limit_s + self.parameters.sweep_s
             self.context.set_watchdog("answer", limit_s)
-        scan = self._scan
-        if scan is not None:
-            sweep = min(scan.sweep, len(self.parameters.exposures_ms) - 1)
-            from_deg, to_deg = self.parameters.sweep_range_deg(self._sweep_count)
-            fields = {
-                "scan": scan.number,
-                "sweep": sweep,
-                "attempt": scan.attempt,
-                "scan_time_s": scan.scan_time_s,
-                "scan_start_ns": scan.start_ns,
-                "from_deg": from_deg,
-                "to_deg": to_deg,
-                "duration_s": self.parameters.sweep_s,
-                "exposure_ms": self.parameters.exposures_ms[sweep],
-            } | fields
+        if self._scan is not None:
+            fields = self._scan.command_fields(self.parameters, self._sweep_count) | fields
         command = ScanCommand(
             command_id=self._command_id,
             incarnation=self.context.incarnation,
@@ -421,27 +407,8 @@ class SequencerNode(Node[SequencerParameters]):
         yield Send(topic="/scan/command", message=command)
 
     def _status(self, text: str) -> Output:
-        parameters, scan = self.parameters, self._scan
-        sweeps = len(parameters.exposures_ms)
-        done = self._next_scan - 1 + (scan.sweep / sweeps if scan else 0.0)
-        fraction = min(1.0, done / parameters.scans)
-        left = parameters.scans - done
-        step_s = parameters.interval_s or -1.0
-        remaining_s = step_s * max(0.0, left - 1) + parameters.scan_duration_s() * min(1.0, left)
-        return Send(
-            topic="/scan/status",
-            message=ScanStatus(
-                state=self._state,
-                sample=parameters.sample,
-                scan=scan.number if scan else min(self._next_scan, parameters.scans),
-                scans=parameters.scans,
-                sweep=scan.sweep + 1 if scan else 0,
-                sweeps=sweeps,
-                fraction=1.0 if self._state == "finished" else fraction,
-                remaining_s=remaining_s if parameters.interval_s > 0 else -1.0,
-                text=text,
-            ),
-        )
+        status = progress(self.parameters, self._state, self._scan, self._next_scan, text)
+        return Send(topic="/scan/status", message=status)
 
     # -- people
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from tvbrdf_messages.messages import ScanStatus
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,4 +78,41 @@ class Scan:
     scan_time_s: float
     sweep: int = 0
     attempt: int = 1
-    restarts: int = 0
+
+    def command_fields(self, parameters: SequencerParameters, sweep_count: int) -> dict[str, Any]:
+        """Return what every command of this scan says of it."""
+        sweep = min(self.sweep, len(parameters.exposures_ms) - 1)
+        from_deg, to_deg = parameters.sweep_range_deg(sweep_count)
+        return {
+            "scan": self.number,
+            "sweep": sweep,
+            "attempt": self.attempt,
+            "scan_time_s": self.scan_time_s,
+            "scan_start_ns": self.start_ns,
+            "from_deg": from_deg,
+            "to_deg": to_deg,
+            "duration_s": parameters.sweep_s,
+            "exposure_ms": parameters.exposures_ms[sweep],
+        }
+
+
+def progress(
+    parameters: SequencerParameters, state: str, scan: Scan | None, next_scan: int, text: str
+) -> ScanStatus:
+    """Return how far the measurement is; the time left is negative where people decide."""
+    sweeps = len(parameters.exposures_ms)
+    done = next_scan - 1 + (scan.sweep / sweeps if scan else 0.0)
+    left = parameters.scans - done
+    remaining_s = parameters.interval_s * max(0.0, left - 1)
+    remaining_s += parameters.scan_duration_s() * min(1.0, left)
+    return ScanStatus(
+        state=state,
+        sample=parameters.sample,
+        scan=scan.number if scan else min(next_scan, parameters.scans),
+        scans=parameters.scans,
+        sweep=scan.sweep + 1 if scan else 0,
+        sweeps=sweeps,
+        fraction=1.0 if state == "finished" else min(1.0, done / parameters.scans),
+        remaining_s=remaining_s if parameters.interval_s > 0 else -1.0,
+        text=text,
+    )
