@@ -10,7 +10,14 @@ from .errors import COMMAND_LINE, LaunchError, Place, did_you_mean
 from .substitution import Scope, substitute
 from .yaml_items import Item, parse_value
 
-TYPES: dict[str, type] = {"str": str, "int": int, "float": float, "bool": bool, "list": list}
+TYPES: dict[str, type] = {
+    "str": str,
+    "int": int,
+    "float": float,
+    "bool": bool,
+    "list": list,
+    "dict": dict,
+}
 REFUSALS = {
     "speedup": "; speedup is for rigs that are simulated altogether: real devices take real time"
 }
@@ -23,7 +30,7 @@ class Argument:
 
     name: str
     type: str
-    """``str``, ``int``, ``float``, ``bool``, ``list`` or, for none of them, ``any``."""
+    """``str``, ``int``, ``float``, ``bool``, ``list``, ``dict`` or, for none of them, ``any``."""
     default: Item | None
     """None: it must be given."""
     description: str

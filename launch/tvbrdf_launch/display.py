@@ -61,6 +61,7 @@ class Display:
         self._stream: IO[str] | None = sys.stdout if stream is None else stream
         self._log: IO[str] | None = None
         self._faults: dict[str, str] = {}
+        self._told: dict[str, str] = {}
         self._fitted: dict[int, str] = {}
         self._last_status = ""
 
@@ -76,6 +77,12 @@ class Display:
         except OSError:  # nobody looks any more; the run goes on
             self._stream = None
 
+    def fail(self, text: str) -> None:
+        """Show what went wrong; plain lines go to standard error."""
+        self._keep(f"error: {text}")
+        with contextlib.suppress(OSError):
+            self._show_error(f"tvbrdf: error: {text}")
+
     def take(self, envelope: Envelope) -> None:
         """Show what a message tells, if it tells something to people."""
         message = envelope.message
@@ -88,6 +95,7 @@ class Display:
                 self._fitted[message.scan] = line
                 self.say(line)
         elif isinstance(message, Log) and message.level in ("warning", "error"):
+            self._told[message.node] = message.text
             self.say(f"{message.node}: {message.level}: {message.text}")
         elif isinstance(message, Diagnostics):
             self._take_diagnostics(message)
@@ -112,6 +120,9 @@ class Display:
             self._stream.write(f"{text}\n")
             self._stream.flush()
 
+    def _show_error(self, text: str) -> None:
+        sys.stderr.write(f"{text}\n")
+
     def _take_status(self, status: ScanStatus) -> None:
         line = status_line(status)
         if line == self._last_status:
@@ -123,7 +134,8 @@ class Display:
 
     def _take_diagnostics(self, message: Diagnostics) -> None:
         fault = message.text or "fault" if message.state == "fault" else ""
-        if fault and self._faults.get(message.node) != fault:
+        known = (self._faults.get(message.node), self._told.get(message.node))
+        if fault and fault not in known:
             self.say(f"{message.node}: fault: {fault}")
         self._faults[message.node] = fault
 

@@ -36,6 +36,9 @@ class TerminalDisplay(Display):
         if self._stream is not None:
             self._console.print(text, markup=False, highlight=False)
 
+    def _show_error(self, text: str) -> None:
+        self._show(text)
+
     def _take_status(self, status: ScanStatus) -> None:
         if self._task is None:
             self._progress.start()

@@ -34,8 +34,8 @@ HURRY_S = 1.0
 """Both, after a second Ctrl-C."""
 WORKED_S = 60.0
 """A node that worked that long has all its restarts again."""
-READY_S = 15.0
-"""After that it is told which nodes are not ready."""
+RUNNING_S = 15.0
+"""After that it is told which nodes do not run."""
 OK, FAILED = 0, 1
 POLLIN = 1
 """``zmq.POLLIN``, without loading zmq."""
@@ -60,13 +60,13 @@ class Launcher:
         self._plan, self._folder, self._make_display = plan, folder, make_display
         self._run = folder.path
         self._nodes = {n.name: NodeProcess(n, self._run) for n in plan.nodes}
-        for name, node in self._nodes.items():
-            node.was_ready = "/diagnostics" not in plan.graph.find(name).gives  # it can't say so
+        self._silent = {n for n in self._nodes if "/diagnostics" not in plan.graph.find(n).gives}
+        """Nodes that can't say how they are."""
         self._table = ProcessTable(ProcessRecord(os.getpid(), start_ticks(os.getpid())))
         self._code = OK
         self._interrupts = 0
         self._restarts_due: dict[str, float] = {}
-        self._ready_due = math.inf
+        self._running_due = math.inf
         self._tick_due = math.inf
         self._stages: list[tuple[str, ...]] | None = None
         """Groups of nodes that are still to be stopped; None: the run goes on."""
@@ -131,7 +131,7 @@ class Launcher:
         for node in self._nodes.values():
             if not self._start(node):
                 break
-        self._ready_due = time.monotonic() + READY_S
+        self._running_due = time.monotonic() + RUNNING_S
         self._write_table("running" if self._stages is None else "stopping")
 
     def _start(self, node: NodeProcess) -> bool:
@@ -167,7 +167,7 @@ class Launcher:
 
     def _wait(self, signals: _SignalPipe) -> None:
         """Wait until something happens or is due, and deal with it."""
-        due = (self._ready_due, self._tick_due, self._terminate_due, self._kill_due)
+        due = (self._running_due, self._tick_due, self._terminate_due, self._kill_due)
         next_s = min((*due, *self._restarts_due.values()))
         wait_s = next_s - time.monotonic()
         wait_ms = None if math.isinf(wait_s) else max(0, math.ceil(1000 * wait_s))
@@ -186,11 +186,15 @@ class Launcher:
             del self._restarts_due[name]
             if self._start(self._nodes[name]):
                 self._write_table("running")
-        if now >= self._ready_due:
-            self._ready_due = math.inf
-            late = [n.name for n in self._nodes.values() if n.alive and not n.was_ready]
-            if late and self._stages is None and self._watcher is not None:
-                self._display.say(f"still not ready: {', '.join(late)}")
+        if now >= self._running_due:
+            self._running_due = math.inf
+            late = [
+                name
+                for name, node in self._nodes.items()
+                if node.alive and not node.reports and name not in self._silent
+            ]
+            if late and self._stages is None:
+                self._display.say(f"these do not run yet: {', '.join(late)}")
         if now >= self._tick_due:
             self._tick_due = now + (self._display.tick_s or math.inf)
             self._display.tick()
@@ -198,7 +202,7 @@ class Launcher:
             self._terminate_due = math.inf
             for node in self._still_stopping():
                 self._display.say(f"{node.name} does not stop; SIGTERM")
-                node.signal(signal.SIGTERM)
+                node.terminate()
         if now >= self._kill_due:
             self._kill_due = math.inf
             self._kill(self._still_stopping())
@@ -212,8 +216,9 @@ class Launcher:
                 return
             message: Any = arrival.envelope.message
             node = self._nodes.get(arrival.envelope.header.publisher)
-            if arrival.envelope.topic == "/diagnostics" and node is not None:
-                node.was_ready |= message.state in ("ready", "running")
+            told = arrival.envelope.topic == "/diagnostics" and message.state == "running"
+            if told and node is not None:
+                node.report()
             with contextlib.suppress(ValueError, TypeError, ArithmeticError):
                 self._display.take(arrival.envelope)  # a strange message never ends the run
 
@@ -243,7 +248,7 @@ class Launcher:
     def _take_failure(self, node: NodeProcess, code: int) -> None:
         what = f"node {node.name} failed ({describe_exit(code)})"
         by_itself = code > 0
-        if by_itself and not node.was_ready and node.incarnations == 1:
+        if by_itself and not node.has_run and node.name not in self._silent:
             self._fail(f"node {node.name} failed at start ({describe_exit(code)})", node)
         elif node.plan.restart.policy == "never" or (by_itself and node.plan.ends_run):
             self._fail(what, node)
@@ -267,12 +272,14 @@ class Launcher:
 
     def _take_end(self, node: NodeProcess, code: int) -> None:
         """Take note of the end of a node while the run is being stopped."""
-        unasked = not node.stop_sent
-        started = self._interrupts == 0 or node.was_ready
-        if node.name not in self._killed and code != 0 and started:
-            when = "before it was asked to stop" if unasked else "while it stopped"
-            self._report(f"node {node.name} failed {when} ({describe_exit(code)})", node)
-            self._code = self._code or FAILED
+        if code != 0 and node.name not in self._killed:
+            when = "while it stopped" if node.stop_sent else "before it was asked to stop"
+            text = f"node {node.name} failed {when} ({describe_exit(code)})"
+            if self._code == OK:
+                self._report(text, node)
+                self._code = FAILED
+            else:  # most likely a consequence; the cause has been told
+                self._display.say(f"{text}; see {node.log_path}")
         if not self._still_stopping():
             self._stop_next()
 
@@ -299,7 +306,7 @@ class Launcher:
         lines = node.last_lines() if node is not None else []
         if node is not None and lines:
             text = "\n  | ".join([f"{text}; the end of {node.log_path}:", *lines])
-        self._display.say(f"error: {text}")
+        self._display.fail(text)
 
     def _stop(self, code: int) -> None:
         """Begin to stop everything in order."""

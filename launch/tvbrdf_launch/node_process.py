@@ -14,6 +14,7 @@ from .plan import PlannedNode
 from .process_table import ProcessRecord, start_ticks
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_AGAIN = b"--- started again: incarnation"
 LOG_LINES = 15
 """Of a failed node's log, shown with the failure."""
 
@@ -38,8 +39,10 @@ class NodeProcess:
         self.incarnations = 0
         self.restarts = 0
         """In a row: since it last worked for long enough."""
-        self.was_ready = False
-        """Whether it has ever said that it is ready; before that a failure is one of the start."""
+        self.reports = 0
+        """How often it has said that it runs, since it was last started."""
+        self.has_run = False
+        """Whether it ever said so a second time; before that, a failure is one of its start."""
         self.started_s = 0.0
         self.exit_code: int | None = None
         self.stop_sent = False
@@ -60,7 +63,7 @@ class NodeProcess:
         try:
             with self.log_path.open("ab", buffering=0) as log:
                 if self.incarnations > 1:
-                    log.write(b"--- started again, the %dth time\n" % self.incarnations)
+                    log.write(b"%s %d\n" % (_AGAIN, self.incarnations))
                 command = [sys.executable, "-P", "-m", "tvbrdf_nodes.core.process"]
                 self._process = subprocess.Popen(
                     [*command, "--run", str(self._run), "--name", self.name],
@@ -79,13 +82,26 @@ class NodeProcess:
         pid = self._process.pid
         self.pidfd = os.pidfd_open(pid)
         self.exit_code = None
+        self.reports = 0
         self.started_s = time.monotonic()
         self.record = ProcessRecord(pid, start_ticks(pid), self.incarnations)
 
+    def report(self) -> None:
+        """Take note that it has said that it runs."""
+        self.reports += 1
+        self.has_run |= self.reports > 1
+
     def ask_to_stop(self) -> None:
-        """Ask it to end: SIGINT, and the end of its lifeline, which can't be missed."""
+        """Ask it to end: by SIGINT, or by its lifeline while it may not yet have a handler."""
         self.stop_sent = True
-        self.signal(signal.SIGINT)
+        if self.reports:
+            self.signal(signal.SIGINT)
+        else:
+            self._close_lifeline()
+
+    def terminate(self) -> None:
+        """Ask it to end once more: by SIGTERM and by the end of its lifeline."""
+        self.signal(signal.SIGTERM)
         self._close_lifeline()
 
     def signal(self, number: signal.Signals) -> None:
@@ -118,14 +134,16 @@ class NodeProcess:
             self.reap()
 
     def last_lines(self, count: int = LOG_LINES) -> list[str]:
-        """Return the last lines of its log."""
+        """Return the last lines of its log, since it was last started."""
         try:
             with self.log_path.open("rb") as log:
                 log.seek(max(0, log.seek(0, os.SEEK_END) - 16384))
                 text = log.read().decode(errors="replace")
         except OSError:
             return []
-        return text.splitlines()[-count:]
+        lines = text.splitlines()
+        marks = [i for i, line in enumerate(lines) if line.startswith(_AGAIN.decode())]
+        return lines[marks[-1] + 1 if marks else 0 :][-count:]
 
     def _close_lifeline(self) -> None:
         if self._lifeline >= 0:

@@ -20,7 +20,7 @@ from ._common import (
 )
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.calibration import Calibration
+    from tvbrdf_fitting.calibration import CameraCalibration
     from tvbrdf_messages.bus.watcher import Watcher
     from tvbrdf_messages.messages import Frame
     from tvbrdf_messages.run_directory import Graph
@@ -53,15 +53,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the verb."""
     directory, graph = open_run(arguments)
     require_going_on(directory)
-    calibration = _calibration(graph)
+    calibrations = _calibrations(graph)
     stills = _take(graph, arguments.timeout)
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     rows, files = [], []
     for name in sorted(stills):
         frames = sorted(stills[name], key=lambda frame: frame.exposure_ms)
-        rows += [_figures(frame, calibration) for frame in frames]
-        files += _write(out, frames, calibration)
+        rows += [_figures(frame, calibrations.get(name)) for frame in frames]
+        files += _write(out, frames, calibrations.get(name))
     if arguments.json:
         print_json({"stills": [row.as_dict() for row in rows], "files": files})
     else:
@@ -116,44 +116,36 @@ def _exposures(graph: Graph) -> int:
     return len(getattr(parameters, "exposures_ms", ())) or 1
 
 
-def _calibration(graph: Graph) -> Calibration | None:
-    """Return the calibration that the run's merger works with; None if there is none."""
+def _calibrations(graph: Graph) -> dict[str, CameraCalibration]:
+    """Return the calibration of each camera of the run's merger; none where it has none."""
     from tvbrdf_fitting.calibration import load_calibration
+    from tvbrdf_nodes.core.loading import load_class
+    from tvbrdf_nodes.core.parameters import build
 
     for participant in graph.participants:
         path = participant.parameters.get("calibration")
-        if isinstance(path, str):
-            try:
-                return load_calibration(path)
-            except (OSError, ValueError) as error:
-                sys.stderr.write(f"tvbrdf: warning: no radiance: {error}\n")
-    return None
+        if not isinstance(path, str):
+            continue
+        kind = load_class(participant.node).parameters_type
+        names = getattr(build(kind, participant.parameters), "cameras", ())
+        try:
+            calibration = load_calibration(path)
+        except (OSError, ValueError) as error:
+            sys.stderr.write(f"tvbrdf: warning: no radiance: {error}\n")
+            continue
+        return dict(zip(names, calibration.cameras, strict=False))
+    return {}
 
 
-def _number(camera: str) -> int:
-    """Return a camera's number in the calibration: that at the end of its name."""
-    digits = camera.rpartition("_")[2]
-    return int(digits) if digits.isdecimal() else 0
-
-
-def _camera(calibration: Calibration | None, name: str) -> Any:
-    numbers = [each.camera for each in calibration.cameras] if calibration is not None else []
-    if calibration is None or _number(name) not in numbers:
-        return None
-    return calibration.camera(_number(name))
-
-
-def _figures(frame: Frame, calibration: Calibration | None) -> Any:
+def _figures(frame: Frame, camera: CameraCalibration | None) -> Any:
     from ..still import figures
 
-    camera = _camera(calibration, frame.camera)
-    top = (1 << frame.bit_depth) - 1
     if camera is None:
-        return figures(frame, top)
+        return figures(frame, (1 << frame.bit_depth) - 1)
     return figures(frame, camera.with_bit_depth(frame.bit_depth).saturation_dn)
 
 
-def _write(out: Path, frames: list[Frame], calibration: Calibration | None) -> list[str]:
+def _write(out: Path, frames: list[Frame], camera: CameraCalibration | None) -> list[str]:
     """Write one camera's stills; return the paths."""
     from ..still import merge_exposures, write_exr, write_png
 
@@ -163,7 +155,6 @@ def _write(out: Path, frames: list[Frame], calibration: Calibration | None) -> l
         path = out / f"{name}_{frame.exposure_ms:g}ms.png"
         write_png(path, frame)
         files.append(str(path))
-    camera = _camera(calibration, name)
     if camera is not None:
         radiance, _ = merge_exposures(frames, camera)
         path = out / f"{name}_radiance.exr"

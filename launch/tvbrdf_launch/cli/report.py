@@ -26,14 +26,17 @@ def run(arguments: argparse.Namespace) -> int:
     if not database.is_dir():
         raise RunError(f"no database {database}: not a folder")
     out = arguments.out or database.resolve().parent
+    from tvbrdf_fitting.published_database import DatabaseError
     from tvbrdf_rendering import make_report
 
     try:
         written = make_report(database, out)
-    except ValueError as error:
-        raise RunError(f"{database}: {error}") from error
+    except DatabaseError as error:
+        raise RunError(str(error)) from error
     if arguments.json:
         print_json({"database": str(database), "out": str(out), "written": written})
-    else:
-        print(f"wrote the report of {database} into {out}")
+        return 0
+    print(f"{written['summary'].read_text().rstrip()}\n")
+    for name, path in written.items():
+        print(f"{name:14} {path}")
     return 0

@@ -53,8 +53,8 @@ class InProcessGraph:
             runner.set_state(READY)
             runner.node.prepare()
         for runner in self.runners.values():
-            runner.set_state(RUNNING)
             runner.put(runner.node.start())
+            runner.set_state(RUNNING)
         return self
 
     def __exit__(

@@ -101,8 +101,8 @@ class NodeProcess:
                 runner.set_state(READY)
                 runner.node.prepare()
                 self.port.events()  # of the registrations that were waited for
-                runner.set_state(RUNNING)
                 runner.put(runner.node.start())
+                runner.set_state(RUNNING)
                 gc.collect()
                 gc.freeze()  # what was made at the start is never garbage
                 self._loop()
@@ -245,7 +245,7 @@ def main(argv: list[str] | None = None) -> int:
         process = NodeProcess(
             read_graph(arguments.run), arguments.name, None if arguments.no_lifeline else 0
         )
-    except (BusError, ValueError, zmq.ZMQError) as error:
+    except (BusError, DeviceError, ValueError, zmq.ZMQError) as error:
         sys.stderr.write(f"{arguments.name}: {error}\n")
         return 2
     return process.run()
