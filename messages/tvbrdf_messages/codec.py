@@ -187,15 +187,9 @@ def decode_all(parts: Sequence[Any]) -> list[Envelope]:
     if len(raw_body) > MAX_BODY_BYTES:
         raise MessageError(f"a body of {len(raw_body)} bytes, the limit is {MAX_BODY_BYTES}")
     topic = _topic(bytes(raw_topic))
-    try:
-        unpacker = msgpack.Unpacker(strict_map_key=True, max_buffer_size=MAX_BODY_BYTES)
-        unpacker.feed(raw_body)
-        bodies = list(unpacker)
-        whole = unpacker.tell() == len(raw_body)
-    except Exception as error:  # msgpack raises many kinds for broken bytes
-        raise MessageError(f"{topic.name}: broken msgpack: {error}") from error
-    if not whole or not bodies or (len(bodies) > 1 and len(parts) > 2):
-        raise MessageError(f"{topic.name}: broken msgpack: {len(bodies)} bodies and a rest")
+    bodies = _unpack(raw_body, topic.name)
+    if len(bodies) > 1 and len(parts) > 2:
+        raise MessageError(f"{topic.name}: {len(bodies)} bodies and arrays in one message")
     codec, arrays, name = _codec(topic.type), parts[2:], topic.name
     found = []
     for body in bodies:
@@ -204,6 +198,25 @@ def decode_all(parts: Sequence[Any]) -> list[Envelope]:
         header = _decode_header(body[0], name)
         found.append(Envelope(name, header, codec.decode(body[1], body[2], arrays, name)))
     return found
+
+
+def _unpack(raw: Any, where: str) -> list[Any]:
+    """Return the msgpack objects that follow each other in ``raw``; mostly it is one."""
+    try:
+        return [msgpack.unpackb(raw, strict_map_key=True)]
+    except msgpack.ExtraData:
+        pass
+    except Exception as error:  # msgpack raises many kinds for broken bytes
+        raise MessageError(f"{where}: broken msgpack: {error}") from error
+    unpacker = msgpack.Unpacker(strict_map_key=True, max_buffer_size=MAX_BODY_BYTES)
+    unpacker.feed(raw)
+    try:
+        bodies = list(unpacker)
+    except Exception as error:
+        raise MessageError(f"{where}: broken msgpack: {error}") from error
+    if unpacker.tell() != len(raw):
+        raise MessageError(f"{where}: broken msgpack: {len(bodies)} bodies and a rest")
+    return bodies
 
 
 @lru_cache(maxsize=1024)
@@ -218,5 +231,6 @@ def size_bytes(parts: Sequence[Any]) -> int:
     """Return how many bytes of credit the parts of a message take."""
     total = 0
     for part in parts:
-        total += part.nbytes if hasattr(part, "nbytes") else len(part)
+        # an array counts its bytes; bytes and zmq.Frame have none of it but a length
+        total += len(part) if type(part) is bytes else getattr(part, "nbytes", None) or len(part)
     return total

@@ -171,6 +171,9 @@ class Radiance(Message):
     grid_radiance: Doubles = array_field("float64", shape=(None, None, 3))
     grid_variance: Doubles = array_field("float64", shape=(None, None, 3))
     grid_valid: Bools = array_field("bool", shape=(None, None, 3))
+    frame_relative_std: tuple[float, ...] = ()
+    """Of each camera: the part of a frame's noise, as a part of the signal, that its channels share
+    (the lamp's flicker); it is in ``variance`` already."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,6 +223,8 @@ class Stored(Message):
     what: str
     """``radiance``, ``parameters``, ``missing`` or ``mark``."""
     already: bool = False
+    refused: str = ""
+    """Why it is not on disk and never will be, for what it is; empty if it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,6 +237,8 @@ class DatabaseState(Message):
     missing: tuple[int, ...]
     zero_ns: int = 0
     """Run-clock time of t = 0; 0 when nothing was stored yet."""
+    last_ns: int = 0
+    """Run-clock time of its latest scan, measured or missing; 0 when there is none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

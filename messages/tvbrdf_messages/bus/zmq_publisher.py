@@ -25,6 +25,8 @@ COMMAND_CREDIT_BYTES = 8 << 20
 MESSAGE_OVERHEAD_BYTES = 64
 WATCH_QUEUE_BYTES = 16 << 20
 """What may wait for a slow watcher; older messages are dropped for it."""
+# plain integers: arithmetic with pyzmq's enumerations takes longer than sending does
+DONTWAIT, SNDMORE, POLLIN = int(zmq.DONTWAIT), int(zmq.SNDMORE), int(zmq.POLLIN)
 _BROKEN = (ValueError, KeyError, TypeError, AttributeError, msgpack.UnpackException)
 HELLO, CREDIT, WELCOME, REFUSED = b"!HELLO", b"!CREDIT", b"!WELCOME", b"!REFUSED"
 
@@ -35,7 +37,7 @@ Ready = Container[Any] | None
 
 def readable(socket: zmq.Socket[bytes]) -> bool:
     """Return whether a message waits in the socket."""
-    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+    return bool(int(socket.getsockopt(zmq.EVENTS)) & POLLIN)
 
 
 class _Reader:
@@ -212,14 +214,13 @@ class ZmqPublisher:
 
     @staticmethod
     def _send(socket: zmq.Socket[bytes], identity: bytes | None, parts: list[Any]) -> None:
-        flags = zmq.DONTWAIT
         if identity is not None:
-            socket.send(identity, flags | zmq.SNDMORE)
+            socket.send(identity, DONTWAIT | SNDMORE)
         last = len(parts) - 1
         for index, part in enumerate(parts):
-            more = zmq.SNDMORE if index < last else 0
-            share = hasattr(part, "nbytes") and part.nbytes >= ZERO_COPY_BYTES
-            socket.send(part, flags | more, copy=not share)
+            flags = DONTWAIT | SNDMORE if index < last else DONTWAIT
+            share = type(part) is not bytes and part.nbytes >= ZERO_COPY_BYTES
+            socket.send(part, flags, copy=not share)
 
     # -- what readers and watchers say
 
@@ -228,11 +229,11 @@ class ZmqPublisher:
         self.flush()
         if ready is None or self.watch in ready:
             while readable(self.watch):
-                self._take_subscription(self.watch.recv(zmq.DONTWAIT))
+                self._take_subscription(self.watch.recv(DONTWAIT))
         if ready is not None and self.router not in ready:
             return
         while readable(self.router):
-            parts = self.router.recv_multipart(zmq.DONTWAIT)
+            parts = self.router.recv_multipart(DONTWAIT)
             try:
                 self._take(parts)
             except (
@@ -311,7 +312,7 @@ class ZmqPublisher:
         self.events.append(PortEvent("reader", name, incarnation))
 
     def _say(self, identity: bytes, kind: bytes, body: dict[str, Any]) -> None:
-        self.router.send_multipart([identity, kind, msgpack.packb(body)], zmq.DONTWAIT)
+        self.router.send_multipart([identity, kind, msgpack.packb(body)], DONTWAIT)
 
     def close(self) -> None:
         """Close both sockets; what was sent lingers for a second."""

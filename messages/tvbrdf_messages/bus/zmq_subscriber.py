@@ -14,11 +14,22 @@ from ..errors import MessageError
 from ..run_directory import Graph
 from ..topics import LATEST, LOSSLESS, find_topic
 from .port import PortEvent
-from .zmq_publisher import CREDIT, HELLO, MESSAGE_OVERHEAD_BYTES, REFUSED, WELCOME, Ready, readable
+from .zmq_publisher import (
+    CREDIT,
+    DONTWAIT,
+    HELLO,
+    MESSAGE_OVERHEAD_BYTES,
+    REFUSED,
+    WELCOME,
+    Ready,
+    readable,
+)
 
 DEFAULT_CREDIT_BYTES = 64 << 20
 RECONNECT_MS = 5
-_MORE = zmq.RCVMORE
+BATCH_BYTES = 2 << 20
+"""Handed out at once from one publisher: large images that are held together cost page faults."""
+_MORE = int(zmq.RCVMORE)
 
 
 class _Link:
@@ -42,7 +53,7 @@ class _Link:
         """Give back the credit of what was handled, in few messages."""
         lossless, command = self.handled
         if lossless + command > min(self.credit_bytes // 16, 1 << 20):
-            self.socket.send_multipart([CREDIT, msgpack.packb(self.handled)], zmq.DONTWAIT)
+            self.socket.send_multipart([CREDIT, msgpack.packb(self.handled)], DONTWAIT)
             self.handled = [0, 0]
 
 
@@ -101,7 +112,7 @@ class ZmqSubscriber:
         """Register where a connection was made; notice where one was lost."""
         for link in self.links:
             while (ready is None or link.monitor in ready) and readable(link.monitor):
-                event = parse_monitor_message(link.monitor.recv_multipart(zmq.DONTWAIT))
+                event = parse_monitor_message(link.monitor.recv_multipart(DONTWAIT))
                 if event["event"] == zmq.EVENT_CONNECTED:
                     self._say_hello(link)
                 elif link.incarnation:
@@ -117,7 +128,7 @@ class ZmqSubscriber:
             "topics": link.topics,
             "credit_bytes": self._credit_bytes,
         }
-        link.socket.send_multipart([HELLO, msgpack.packb(hello)], zmq.DONTWAIT)
+        link.socket.send_multipart([HELLO, msgpack.packb(hello)], DONTWAIT)
 
     def receive(self, limit: int, ready: Ready = None) -> list[Envelope]:
         """Return up to about ``limit`` messages; those of the call before count as handled."""
@@ -127,7 +138,9 @@ class ZmqSubscriber:
             link.handled[1] += link.taken[1]
             link.taken = [0, 0]
             if ready is None or link.socket in ready:
-                while len(found) < limit and readable(link.socket):
+                while (
+                    len(found) < limit and sum(link.taken) < BATCH_BYTES and readable(link.socket)
+                ):
                     self._receive_one(link, found)
             link.give_credit()
         latest = self.latest
@@ -199,9 +212,10 @@ class ZmqSubscriber:
 
 def _receive_parts(socket: zmq.Socket[bytes]) -> list[Any]:
     """Return one multipart message; array frames are not copied."""
-    parts: list[Any] = [socket.recv(zmq.DONTWAIT)]
+    parts: list[Any] = [socket.recv(DONTWAIT)]
+    if not socket.getsockopt(_MORE):
+        return parts
+    parts.append(socket.recv(DONTWAIT))
     if socket.getsockopt(_MORE):
-        parts.append(socket.recv(zmq.DONTWAIT))
-        while socket.getsockopt(_MORE):
-            parts.append(socket.recv(zmq.DONTWAIT, copy=False))
+        parts += socket.recv_multipart(DONTWAIT, copy=False)
     return parts
