@@ -81,13 +81,13 @@ class Pair:
             self.port.service()
 
     def receive(self) -> list[Any]:
-        """Return what has come, waiting for at least one message."""
+        """Return what has come, waiting for at least one message, as a node's shell does."""
+        self.port.flush()
         while True:
-            self.port.service()
+            self.port.service(dict(self.poller.poll(100)))
             found = self.port.receive()
             if found:
                 return found
-            self.poller.poll(100)
 
     def take(self, count: int) -> None:
         """Receive that many messages."""

@@ -18,9 +18,8 @@ MIN_CORES = 2
 MIN_PYTHON = (3, 11)
 PROBE_S = 20.0
 _ARAVIS_PROBE = """
-import gi
-gi.require_version("Aravis", "0.8")
-from gi.repository import Aravis
+from tvbrdf_nodes.camera.aravis_library import load_aravis
+Aravis = load_aravis()
 Aravis.update_device_list()
 print(Aravis.get_n_devices())
 """
@@ -180,10 +179,7 @@ def check_cores() -> Iterator[Finding]:
 
 def check_aravis() -> Iterator[Finding]:
     """Look for Aravis and its cameras, in a process of its own: it may hang or crash."""
-    advice = (
-        "for GenICam cameras: install Debian's gir1.2-aravis-0.8 and python3-gi, and make the "
-        "environment with --system-site-packages"
-    )
+    advice = "for GenICam cameras: install Debian's gir1.2-aravis-0.8 and python3-gi"
     try:
         done = subprocess.run(
             [sys.executable, "-c", _ARAVIS_PROBE],
