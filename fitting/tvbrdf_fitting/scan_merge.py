@@ -194,10 +194,10 @@ def sweep_observations(
 ) -> SweepObservations:
     """Calibrate the frames of one sweep, of all cameras.
 
-    Left out are frames taken where the light's position is not known, was further than 90 degrees
-    from the vertical, below the sample's horizon (cosine below 1e-3), or hidden by the arm during
-    any part of the exposure; frames whose exposure is not the sweep's; and repeated ones. A
-    channel with clipped light stays as a row that is not valid.
+    Left out are frames taken where the light's position is not known or was further than 90
+    degrees from the vertical; where the light was below the sample's horizon (cosine below 1e-3)
+    or hidden by the arm during any part of the exposure; frames whose exposure is not the sweep's;
+    and repeated ones. A channel with clipped light stays as a row that is not valid.
 
     Parameters
     ----------
@@ -395,7 +395,11 @@ def _usable(
     reasons = {
         "light_unknown": ~np.isfinite(angle_deg),
         "out_of_range": np.abs(angle_deg) > MAX_LIGHT_ANGLE_DEG + 1e-9,
-        "below_horizon": ~above_horizon(light_direction(angle_deg, tilt_deg)),
+        # a mean over light that partly shines from below is no radiance of any direction
+        "below_horizon": ~(
+            above_horizon(light_direction(angle_deg - swept_deg / 2, tilt_deg))
+            & above_horizon(light_direction(angle_deg + swept_deg / 2, tilt_deg))
+        ),
         "hidden": hidden,
     }
     kept = np.ones(angle_deg.shape, dtype=np.bool_)

@@ -1,7 +1,11 @@
 """How well a fit knows its parameters: random and common errors, and what cannot be determined.
 
 Random errors are those of each value, as the observations state them: covariance
-``(J^T W J)^-1``, not rescaled by chi-square. *Common* errors are shared by whole groups of frames
+``(J^T W J)^-1``, not rescaled by chi-square. A part of a frame's noise, the flicker of the lamp, is
+the same in its three channels; with ``u_f`` the sum over a frame's channels of the weighted
+Jacobian's rows times that part, and ``d`` each of them alone, the covariance is
+``A^-1 (A + sum u u^T - sum d d^T) A^-1`` with ``A = J^T W J``.
+*Common* errors are shared by whole groups of frames
 (the light's offset in a sweep, a gain of a camera and channel), so that more frames do not average
 them out. They are carried to the parameters to first order: with r the model's radiance and nu a
 nuisance, ``S = (J^T W J)^-1 J^T W dr/dnu`` and their covariance is ``S Sigma S^T``.
@@ -41,17 +45,22 @@ class CommonErrors:
         all, or a number by sweep.
     gain_relative_std
         Relative error of each camera's and channel's gain, independent between them.
+    frame_relative_std
+        Part of a frame's noise that its channels share (it is in the variances already),
+        independent between frames: one number for all, or a number by camera. It concerns the
+        random covariance.
     """
 
     light_angle_std_deg: float | Mapping[int, float] = 0.0
     gain_relative_std: float = 0.0
+    frame_relative_std: float | Mapping[int, float] = 0.0
 
     def __post_init__(self) -> None:
-        light = self.light_angle_std_deg
-        angles = light.values() if isinstance(light, Mapping) else [light]
+        light, frame = self.light_angle_std_deg, self.frame_relative_std
         for name, values in (
-            ("light_angle_std_deg", angles),
+            ("light_angle_std_deg", light.values() if isinstance(light, Mapping) else [light]),
             ("gain_relative_std", [self.gain_relative_std]),
+            ("frame_relative_std", frame.values() if isinstance(frame, Mapping) else [frame]),
         ):
             for value in values:
                 if not (math.isfinite(value) and value >= 0):
@@ -64,6 +73,14 @@ class CommonErrors:
                 raise ValueError(f"common errors: no light_angle_std_deg for sweep {sweep}")
             return float(self.light_angle_std_deg[sweep])
         return float(self.light_angle_std_deg)
+
+    def frame_relative_std_of(self, camera: int) -> float:
+        """Return the relative noise that the channels of a camera's frame share."""
+        if isinstance(self.frame_relative_std, Mapping):
+            if camera not in self.frame_relative_std:
+                raise ValueError(f"common errors: no frame_relative_std for camera {camera}")
+            return float(self.frame_relative_std[camera])
+        return float(self.frame_relative_std)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +124,8 @@ def estimate(
     where = np.ix_(columns, columns)
     random[where] = half @ half.T
     if common_errors is not None:
+        shared = _shared_by_channels(problem, jacobian[:, known], observations, common_errors)
+        random[where] += half @ (half.T @ shared @ half) @ half.T
         nuisances = _nuisance_columns(problem, internal, observations, common_errors)
         shift = (half @ half.T) @ (jacobian[:, known].T @ nuisances)
         common[where] = shift @ shift.T
@@ -204,6 +223,20 @@ def undetermined(
             if bound > 0 and abs(total[i, j]) > CONFOUNDED * bound:
                 found.update((i, j))
     return tuple(sorted(found))
+
+
+def _shared_by_channels(
+    problem: Problem, jacobian: FloatArray, observations: Observations, errors: CommonErrors
+) -> FloatArray:
+    """What (q, q) to add to J^T W J for noise that the channels of a frame share."""
+    rows = np.flatnonzero(observations.usable.any(axis=1))
+    cameras, index = np.unique(observations.camera[rows], return_inverse=True)
+    relative = np.array([errors.frame_relative_std_of(int(camera)) for camera in cameras])[index]
+    # never more than all of a value's noise
+    part = np.minimum(relative * np.abs(problem.radiance) * problem.weight, 1.0)
+    each = part[..., None] * jacobian.reshape(*part.shape, -1)
+    together, alone = each.sum(axis=0), each.reshape(-1, each.shape[-1])
+    return np.asarray(together.T @ together - alone.T @ alone)
 
 
 def _nuisance_columns(

@@ -65,19 +65,20 @@ def merged(frames: list[FrameRecord], dark: list[FrameRecord] | None = None) -> 
 
 def test_frames_are_dropped_for_stated_reasons() -> None:
     horizon = -78.0 + np.rad2deg(1e-3)
-    angles = [-95.0, -90.0, horizon - 1e-3, horizon + 1e-3, -1.753, -1.751, 0.0, 1.753, 90.0, 90.1]
-    frames = [record(at_angle(angle)) for angle in angles]
     # 4 ms at 1 degree a second: 0.004 degrees, half of them on each side
+    rising = [-95.0, -90.0, horizon - 1e-3, horizon + 1.9e-3, horizon + 2.1e-3]
+    angles = [*rising, -1.753, -1.751, 0.0, 1.753, 90.0, 90.1]
+    frames = [record(at_angle(angle)) for angle in angles]
     frames.append(record(at_angle(150.0)))
     frames.append(record(at_angle(50.0)))
     frames.append(record(at_angle(50.0), 1065.0))
     frames.append(record(at_angle(60.0), exposure_ms=32.0))
     result = merged(frames)
     np.testing.assert_allclose(
-        result.light_angle_deg, [horizon + 1e-3, -1.753, 1.753, 50.0, 90.0], atol=1e-8
+        result.light_angle_deg, [horizon + 2.1e-3, -1.753, 1.753, 50.0, 90.0], atol=1e-8
     )
     assert result.dropped == {
-        "below_horizon": 2,
+        "below_horizon": 3,
         "hidden": 2,
         "light_unknown": 1,
         "other_exposure": 1,

@@ -51,6 +51,8 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
         self._waiting: list[Envelope] = []
         """What could not be stored yet: the disk was full, or the scan itself has not come."""
         self._stored = self._repeats = 0
+        self._refused: set[int] = set()
+        """Scans whose radiance can't be stored: their parameters can't be either."""
 
     @classmethod
     def topics(cls, name: str, parameters: DatabaseWriterParameters) -> TopicUse:
@@ -78,7 +80,7 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
                 self.parameters.sample,
                 resume=self.parameters.resume,
                 process=self.parameters.process,
-                run_id=self.context.run_directory.name,
+                run_id=f"{self.context.run_directory.name}-{self.context.graph.utc_ns}",
             )
         except DatabaseError as error:
             raise DeviceError(str(error)) from error
@@ -94,6 +96,7 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
                 fitted=store.fitted_scans(),
                 missing=tuple(store.missing_scans()),
                 zero_ns=store.zero_ns(),
+                last_ns=store.last_ns(),
             ),
         )
 
@@ -112,47 +115,55 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
 
         waiting, self._waiting = self._waiting, []
         for envelope in sorted(waiting, key=lambda e: not isinstance(e.message, Radiance)):
-            message = envelope.message
+            if self._must_wait(envelope):
+                self._waiting.append(envelope)
+                continue
+            already, refused = False, ""
             try:
-                if isinstance(message, Parameters) and not self._has_scan(message.scan):
-                    self._waiting.append(envelope)
-                    continue
-                scan, what, outcome = self._put(envelope)
+                already = self._put(envelope) == "already_stored"
             except DiskFullError as error:
                 self.context.log.error(f"{error}; trying again every {RETRY_S:g} s")
                 self._waiting.append(envelope)
                 self.context.set_watchdog("retry", RETRY_S)
                 continue
             except DatabaseError as error:
-                # refused for what it is, so sending it again would not help; say so and go on
-                self.context.log.error(str(error))
-                continue
-            already = outcome == "already_stored"
-            self._stored += not already
-            self._repeats += already
-            yield Send(
-                topic="/scan/stored",
-                message=Stored(
-                    sample=self.parameters.sample, scan=scan, what=what, already=already
-                ),
-            )
+                if not _is_its_own_fault(error):
+                    raise DeviceError(str(error)) from error  # a new start may help
+                refused = str(error)
+                self.context.log.error(refused)
+            yield self._acknowledge(envelope, already=already, refused=refused)
 
-    def _put(self, envelope: Envelope) -> tuple[int, str, Outcome]:
+    def _must_wait(self, envelope: Envelope) -> bool:
+        """Return whether these are parameters of a scan that may still come."""
+        message = envelope.message
+        if not isinstance(message, Parameters) or message.scan in self._refused:
+            return False
+        return message.scan not in self._opened().stored_scans()
+
+    def _acknowledge(self, envelope: Envelope, *, already: bool, refused: str) -> Send:
+        what = _KINDS[type(envelope.message)]
+        scan = getattr(envelope.message, "scan", envelope.header.sequence)
+        if refused and what == "radiance":
+            self._refused.add(scan)
+        self._stored += not (already or refused)
+        self._repeats += already
+        message = Stored(
+            sample=self.parameters.sample, scan=scan, what=what, already=already, refused=refused
+        )
+        return Send(topic="/scan/stored", message=message)
+
+    def _put(self, envelope: Envelope) -> Outcome:
         store, message = self._opened(), envelope.message
         if isinstance(message, Radiance):
-            return message.scan, "radiance", store.store_scan(scan_record(message))
+            return store.store_scan(scan_record(message))
         if isinstance(message, Parameters):
-            return message.scan, "parameters", store.store_parameters(fit_record(message))
+            return store.store_parameters(fit_record(message))
         if isinstance(message, ScanMissing):
-            outcome = store.store_missing(message.scan, message.reason, time_s=message.scan_time_s)
-            return message.scan, "missing", outcome
+            store.check_sample(message.sample)
+            return store.store_missing(message.scan, message.reason, time_s=message.scan_time_s)
         if isinstance(message, Mark):
-            outcome = store.store_note(envelope.header.stamp_ns, message.text, zero=message.zero)
-            return envelope.header.sequence, "mark", outcome
+            return store.store_note(envelope.header.stamp_ns, message.text, zero=message.zero)
         raise TypeError(f"{envelope.topic} is not for the database")
-
-    def _has_scan(self, scan: int) -> bool:
-        return scan in self._opened().stored_scans()
 
     def _opened(self) -> DatabaseStore:
         if self._store is None:
@@ -171,7 +182,18 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
             "stored": self._stored,
             "already_stored": self._repeats,
             "waiting": len(self._waiting),
+            "refused_scans": len(self._refused),
         }
+
+
+_KINDS = {Radiance: "radiance", Parameters: "parameters", ScanMissing: "missing", Mark: "mark"}
+
+
+def _is_its_own_fault(error: Exception) -> bool:
+    """Return whether a message is refused for what it is, not for the state of the disk."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    return not isinstance(error.__cause__, (OSError, SQLAlchemyError))
 
 
 def scan_record(radiance: Radiance) -> ScanRecord:
@@ -203,7 +225,11 @@ def scan_record(radiance: Radiance) -> ScanRecord:
         exposures_ms=radiance.exposures_ms,
         grid=_grid(radiance),
         observations={name: getattr(radiance, name) for name in names},
-        quality={**radiance.quality, "gain_relative_std": radiance.gain_relative_std},
+        quality={
+            **radiance.quality,
+            "gain_relative_std": radiance.gain_relative_std,
+            "frame_relative_std": list(radiance.frame_relative_std),
+        },
     )
 
 

@@ -154,7 +154,7 @@ class DatabaseStore:
         """
         from .entries import enter_scan
 
-        self._check_sample(record.sample)
+        self.check_sample(record.sample)
         files = scan_files(record)
         digest = scan_digest(record, files)
         with explained(self.path, f"storing scan {record.scan}"):
@@ -187,7 +187,7 @@ class DatabaseStore:
         """
         from .entries import check_model, find_scan, fit_row
 
-        self._check_sample(record.sample)
+        self.check_sample(record.sample)
         check_fit(record)
         digest = fit_digest(record)
         with explained(self.path, f"storing the parameters of scan {record.scan}"):
@@ -265,7 +265,14 @@ class DatabaseStore:
                 return scan.start_stamp_ns - round(scan.time_s * 1e9)
         return 0
 
-    def _check_sample(self, sample: str) -> None:
+    def last_ns(self) -> int:
+        """Run-clock time of the latest scan, measured or missing; 0 if none is known."""
+        zero_ns, scans = self.zero_ns(), self._scans()
+        times = [scan.time_s for scan in scans if scan.time_s is not None]
+        return zero_ns + round(1e9 * max(times)) if zero_ns and times else 0
+
+    def check_sample(self, sample: str) -> None:
+        """Refuse what is of another sample."""
         if sample != self.sample_name:
             raise DatabaseError(
                 f"{self.path}: is the database of sample {self.sample_name!r}; what was sent is "

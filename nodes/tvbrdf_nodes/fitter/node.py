@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import Parameters, Radiance, Stored
 
+from ..core.device import DeviceError
 from ..core.node import Node, Outputs, Release, Send, TopicUse
 
 if TYPE_CHECKING:
@@ -50,10 +51,13 @@ class FitterNode(Node[FitterParameters]):
         from tvbrdf_fitting.fit import fit_scan  # noqa: F401 - takes most of a second
         from tvbrdf_fitting.models import get_model
 
-        names = get_model(self.parameters.model).parameter_names
+        try:
+            names = get_model(self.parameters.model).parameter_names
+        except ValueError as error:
+            raise DeviceError(f"model: {error}") from error
         unknown = sorted(set(self.parameters.fixed) - set(names))
         if unknown:
-            raise ValueError(
+            raise DeviceError(
                 f"fixed: {', '.join(unknown)}: {self.parameters.model} has {', '.join(names)}"
             )
 
@@ -72,7 +76,9 @@ class FitterNode(Node[FitterParameters]):
 
         offsets = dict(enumerate(radiance.light_angle_std_deg.tolist()))
         common = CommonErrors(
-            light_angle_std_deg=offsets, gain_relative_std=radiance.gain_relative_std
+            light_angle_std_deg=offsets,
+            gain_relative_std=radiance.gain_relative_std,
+            frame_relative_std=dict(enumerate(radiance.frame_relative_std, start=1)),
         )
         try:
             result = fit_scan(

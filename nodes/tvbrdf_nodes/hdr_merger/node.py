@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 KEPT_STATES = 20_000
 """Of the arm: far more than a sweep has."""
+KEPT_SWEEPS, KEPT_COMMANDS = 12, 1000
+"""Sweeps that were given up stay until their scan or a later one is published, or these are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +40,8 @@ class HdrMergerParameters:
     arm: str = "arm"
     bit_depth: int | None = None
     """Of the frames, where it is not the calibration's."""
+    correct_motion_blur: bool = True
+    """Frames average over the light's way during their exposure; only a simulation may not."""
 
 
 class HdrMergerNode(Node[HdrMergerParameters]):
@@ -52,7 +56,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         self._reducers: dict[int, FrameReducer] = {}
         self._sweeps: dict[SweepKey, Sweep] = {}
         self._states: list[Envelope] = []
-        self._commands: dict[int, ScanCommand] = {}
+        self._commands: dict[SweepKey, ScanCommand] = {}
         self._dark: dict[tuple[int, int], list[tuple[tuple[Any, ...], FrameRecord]]] = {}
         self._done: dict[int, dict[int, tuple[SweepObservations, dict[str, Any]]]] = {}
         """Good sweeps of each scan that is under way."""
@@ -108,20 +112,18 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             if len(self._states) > 2 * KEPT_STATES:
                 del self._states[:KEPT_STATES]
         elif isinstance(message, ScanCommand):
-            self._take_command(message)
+            yield from self._take_command(message)
         elif isinstance(message, SweepResult):
-            yield from self._take_result(message)
+            yield from self._take_result(envelope, message)
         elif isinstance(message, Stored):
             yield from self._take_stored(message)
 
-    def _take_command(self, command: ScanCommand) -> None:
+    def _take_command(self, command: ScanCommand) -> Outputs:
         if command.action == "prepare":
-            self._commands = {command.scan: command}
-            # an attempt that was given up, and scans before this one, are no longer wanted
             key = (command.scan, command.sweep, command.attempt)
-            self._sweeps = {k: v for k, v in self._sweeps.items() if k >= key}
-            self._done = {k: v for k, v in self._done.items() if k >= command.scan}
-            self._dark = {k: v for k, v in self._dark.items() if k[0] >= command.scan}
+            self._commands[key] = command
+            _keep_last(self._commands, KEPT_COMMANDS)
+            yield from self._finish_when_whole(key)
 
     def _take_frame(self, envelope: Envelope, frame: Frame) -> Outputs:
         number = self._numbers.get(frame.camera)
@@ -145,6 +147,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             )
             order = (number, header.incarnation, header.sequence)
             self._dark.setdefault((frame.scan, frame.attempt), []).append((order, record))
+            _keep_last(self._dark, KEPT_SWEEPS)
             return
         sweep = self._sweep((frame.scan, frame.sweep, frame.attempt))
         sweep.frames.setdefault(number, []).append(
@@ -159,9 +162,11 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         )
 
     def _sweep(self, key: SweepKey) -> Sweep:
-        return self._sweeps.setdefault(key, Sweep())
+        sweep = self._sweeps.setdefault(key, Sweep())
+        _keep_last(self._sweeps, KEPT_SWEEPS)
+        return sweep
 
-    def _take_result(self, result: SweepResult) -> Outputs:
+    def _take_result(self, envelope: Envelope, result: SweepResult) -> Outputs:
         if result.action != "sweep" or result.state != "done":
             return
         if result.source != self.parameters.arm and result.source not in self._numbers:
@@ -169,28 +174,41 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         key = (result.scan, result.sweep, result.attempt)
         sweep = self._sweep(key)
         sweep.results[result.source] = result
-        if len(sweep.results) == 1 + len(self._numbers):
-            yield from self._finish(key, sweep)
+        if result.source == self.parameters.arm:
+            sweep.arm_incarnation = envelope.header.incarnation
+        yield from self._finish_when_whole(key)
 
     # -- a sweep is whole
 
-    def _finish(self, key: SweepKey, sweep: Sweep) -> Outputs:
-        calibration = self._calibrated()
+    def _finish_when_whole(self, key: SweepKey) -> Outputs:
+        """Work through a sweep once its command and everybody's end of it are there."""
+        sweep, command = self._sweeps.get(key), self._commands.get(key)
+        if sweep is None or command is None or len(sweep.results) <= len(self._numbers):
+            return
+        yield from self._finish(key, sweep, command)
+
+    def _finish(self, key: SweepKey, sweep: Sweep, command: ScanCommand) -> Outputs:
         del self._sweeps[key]
         scan, number, _ = key
-        command = self._commands.get(scan)
         try:
-            if command is None:
-                raise SweepError("its command never came")
             check_complete(sweep, self._numbers)
             found = solve_sweep(
-                sweep, key, self._dark_frames(scan), self._states, calibration, self.parameters.arm
+                sweep,
+                key,
+                self._dark_frames(scan),
+                self._states,
+                self._calibrated(),
+                self.parameters.arm,
+                correct_motion_blur=self.parameters.correct_motion_blur,
             )
         except SweepError as error:
             yield self._result(key, "broken", str(error))
             return
         self._states = self._states[-KEPT_STATES:]
         done = self._done.setdefault(scan, {})
+        _keep_last(self._done, KEPT_SWEEPS)
+        if number == 0:
+            done.clear()  # the scan was begun anew
         done[number] = found
         if len(done) == len(command.exposures_ms):
             yield from self._publish(command)
@@ -213,7 +231,8 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         from tvbrdf_fitting.scan_merge import assemble_scan
 
         calibration = self._calibrated()
-        done = self._done.pop(command.scan)
+        done = self._done[command.scan]
+        self._forget(command.scan)
         scan = assemble_scan([observations for observations, _ in done.values()], calibration)
         grid = merge_on_grid(scan, calibration)
         radiance = Radiance(
@@ -241,6 +260,9 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             grid_radiance=grid.radiance,
             grid_variance=grid.variance,
             grid_valid=grid.valid,
+            frame_relative_std=tuple(
+                calibration.camera(number).relative_noise_std for number in self._numbers.values()
+            ),
         )
         self._unstored[command.scan] = {"radiance", "parameters"}
         yield Send(
@@ -250,11 +272,18 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             keep=str(command.scan),
         )
 
+    def _forget(self, scan: int) -> None:
+        """Drop what is left of a scan that was published, and of those before it."""
+        self._sweeps = {key: value for key, value in self._sweeps.items() if key[0] > scan}
+        self._commands = {key: value for key, value in self._commands.items() if key[0] > scan}
+        self._dark = {key: value for key, value in self._dark.items() if key[0] > scan}
+        self._done = {key: value for key, value in self._done.items() if key > scan}
+
     def _take_stored(self, stored: Stored) -> Outputs:
         left = self._unstored.get(stored.scan)
         if left is not None:
             left.discard(stored.what)
-            if not left:
+            if not left or (stored.what == "radiance" and stored.refused):
                 del self._unstored[stored.scan]
                 yield Release("/scan/radiance", str(stored.scan))
 
@@ -280,6 +309,12 @@ class HdrMergerNode(Node[HdrMergerParameters]):
     def diagnostics(self) -> dict[str, Any]:
         """See :class:`~tvbrdf_nodes.core.node.Node`."""
         return {"frames": self._frames, "unstored": len(self._unstored)}
+
+
+def _keep_last(kept: dict[Any, Any], count: int) -> None:
+    """Drop the entries with the smallest keys beyond so many."""
+    while len(kept) > count:
+        del kept[min(kept)]
 
 
 def _gain_std(scan: ScanObservations) -> float:

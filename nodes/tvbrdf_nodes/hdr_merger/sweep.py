@@ -35,6 +35,8 @@ class Sweep:
 
     frames: dict[int, list[ReducedFrame]] = field(default_factory=dict)
     results: dict[str, SweepResult] = field(default_factory=dict)
+    arm_incarnation: str = ""
+    """Of the arm's node that told its result: sequence numbers are this life's."""
 
 
 class SweepError(ValueError):
@@ -51,7 +53,9 @@ def check_complete(sweep: Sweep, cameras: Mapping[str, int]) -> None:
             raise SweepError(f"{name} sent {result.frames} frames, {got} arrived")
 
 
-def solve_arm(states: list[Envelope], result: SweepResult) -> tuple[Any, float, dict[str, float]]:
+def solve_arm(
+    states: list[Envelope], result: SweepResult, incarnation: str
+) -> tuple[Any, float, dict[str, float]]:
     """Return the light's path in a sweep, the deviation of its stamps (ns), and its clock.
 
     The states are those that the arm counted to the sweep, whenever they came.
@@ -63,7 +67,8 @@ def solve_arm(states: list[Envelope], result: SweepResult) -> tuple[Any, float, 
         {
             envelope.header.sequence: envelope
             for envelope in states
-            if result.first_sequence <= envelope.header.sequence <= result.last_sequence
+            if envelope.header.incarnation == incarnation
+            and result.first_sequence <= envelope.header.sequence <= result.last_sequence
         }.items()
     )
     if len(chosen) != result.last_sequence - result.first_sequence + 1:
@@ -98,12 +103,15 @@ def solve_sweep(
     states: list[Envelope],
     calibration: Calibration,
     arm: str,
+    *,
+    correct_motion_blur: bool = True,
 ) -> tuple[SweepObservations, dict[str, Any]]:
     """Return a sweep's calibrated observations, and what was found about its clocks."""
     from tvbrdf_fitting.clock_model import ClockError, frame_stamps
+    from tvbrdf_fitting.motion_blur import without_motion_blur
     from tvbrdf_fitting.scan_merge import FrameRecord, sweep_observations
 
-    path, arm_std_ns, arm_facts = solve_arm(states, sweep.results[arm])
+    path, arm_std_ns, arm_facts = solve_arm(states, sweep.results[arm], sweep.arm_incarnation)
     records: list[FrameRecord] = []
     stds_ns: dict[int, float] = {}
     facts: dict[str, Any] = {"arm": arm_facts}
@@ -139,4 +147,6 @@ def solve_sweep(
         )
     except ValueError as error:
         raise SweepError(str(error)) from error
+    if correct_motion_blur:
+        observations = without_motion_blur(observations)
     return observations, {**facts, "dropped": dict(observations.dropped)}

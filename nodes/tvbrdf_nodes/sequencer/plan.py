@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import Any
 
 from tvbrdf_messages.messages import ScanStatus
@@ -77,7 +78,30 @@ class Scan:
     start_ns: int
     scan_time_s: float
     sweep: int = 0
-    attempt: int = 1
+    tries: Counter[int] = field(default_factory=Counter)
+    """How often each sweep has been begun for nothing."""
+
+    @property
+    def attempt(self) -> int:
+        """From 1; no two tries of one sweep have the same."""
+        return self.tries[self.sweep] + 1
+
+    @property
+    def key(self) -> tuple[int, int, int]:
+        """Scan, sweep and attempt."""
+        return (self.number, self.sweep, self.attempt)
+
+    @property
+    def most_tries(self) -> int:
+        """How often the sweep that broke most has been begun for nothing."""
+        return max(self.tries.values(), default=0)
+
+    def begin_again(self, *, from_first: bool) -> None:
+        """Take this sweep again, or all up to it when the earlier ones are lost as well."""
+        for sweep in range(0 if from_first else self.sweep, self.sweep + 1):
+            self.tries[sweep] += 1
+        if from_first:
+            self.sweep = 0
 
     def command_fields(self, parameters: SequencerParameters, sweep_count: int) -> dict[str, Any]:
         """Return what every command of this scan says of it."""
