@@ -16,7 +16,7 @@ from tvbrdf_launch.stop_order import stop_stages
 RUN = Path("/run/t/1")
 REAL = {
     "sample": "paint",
-    "calibration": "calibration.yaml",
+    "calibration": str(find_launch_file("simulated_rig").with_name("calibration.yaml")),
     "camera_1": "A",
     "camera_2": "B",
     "camera_3": "C",

@@ -27,7 +27,18 @@ WATCH_QUEUE_BYTES = 16 << 20
 """What may wait for a slow watcher; older messages are dropped for it."""
 # plain integers: arithmetic with pyzmq's enumerations takes longer than sending does
 DONTWAIT, SNDMORE, POLLIN = int(zmq.DONTWAIT), int(zmq.SNDMORE), int(zmq.POLLIN)
-_BROKEN = (ValueError, KeyError, TypeError, AttributeError, msgpack.UnpackException)
+_BROKEN = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+    msgpack.UnpackException,
+)
+"""What comes of reading bytes that no reader of ours has sent."""
+MAX_WORD_BYTES = 1 << 20
+"""Of what readers say: far more than a registration has."""
 HELLO, CREDIT, WELCOME, REFUSED = b"!HELLO", b"!CREDIT", b"!WELCOME", b"!REFUSED"
 
 
@@ -101,6 +112,7 @@ class ZmqPublisher:
         self.router.linger = 1000
         self.router.sndhwm = 0  # credit bounds the queue, in bytes
         self.router.rcvhwm = 0
+        self.router.maxmsgsize = MAX_WORD_BYTES  # of what comes in
         self.router.router_mandatory = True  # a reader that died is an error, not silence
         self.router.bind(graph.endpoint(name, "lossless"))
         self.watch = context.socket(zmq.XPUB)
@@ -236,13 +248,7 @@ class ZmqPublisher:
             parts = self.router.recv_multipart(DONTWAIT)
             try:
                 self._take(parts)
-            except (
-                ValueError,
-                KeyError,
-                TypeError,
-                AttributeError,
-                msgpack.UnpackException,
-            ) as bad:
+            except _BROKEN as bad:
                 self.refused += 1
                 self.events.append(PortEvent("refused", "unknown", text=f"{bad!s:.200}"))
             except zmq.ZMQError as error:
@@ -283,6 +289,12 @@ class ZmqPublisher:
         unnamed = [t for t in sorted(topics) if name not in self._wanted.get(t, ())]
         if unnamed:
             reason = f"the graph names no reader {name!r} of {', '.join(unnamed)} from {self._name}"
+            self._say(identity, REFUSED, {"reason": reason})
+            raise MessageError(reason)
+        wanted = {topic for topic, readers in self._wanted.items() if name in readers}
+        if not topics or topics != wanted:
+            # taken in place of the true one, it would keep this publisher waiting for good
+            reason = f"{name!r:.40} does not ask {self._name} for all that the graph gives it"
             self._say(identity, REFUSED, {"reason": reason})
             raise MessageError(reason)
         old = self._readers.get(name)

@@ -137,6 +137,8 @@ class Node(Generic[P]):
     parameters_type: ClassVar[type[Any]] = NoParameters
     has_service: ClassVar[bool] = False
     """Whether people may ask it things (:meth:`on_request`)."""
+    drains: ClassVar[bool] = False
+    """Whether it takes what has arrived before it stops; nothing that moves hardware may."""
 
     def __init__(self, context: NodeContext, parameters: P) -> None:
         self.context = context

@@ -32,6 +32,8 @@ from .device import DeviceError
 from .runner import FAULT, READY, RUNNING, STOPPING, NodeRunner
 
 DIAGNOSTICS_S = 1.0
+DRAIN_LIMIT_S, DRAIN_QUIET_MS = 2.0, 50
+"""At most, and after how long without a message."""
 STOP_LIMIT_S = 5.0
 """A node that has not ended by then after its launcher is gone is ended."""
 
@@ -106,6 +108,8 @@ class NodeProcess:
                 gc.collect()
                 gc.freeze()  # what was made at the start is never garbage
                 self._loop()
+                if runner.node.drains and runner.exit is None:
+                    self._drain()
         except StoppedError:
             pass
         except (DeviceError, BusError, OSError) as error:
@@ -155,6 +159,15 @@ class NodeProcess:
                 next_diagnostics = now + DIAGNOSTICS_S
                 runner.tell_diagnostics()
             port.flush()
+
+    def _drain(self) -> None:
+        """Take what was sent before the stop: nodes stop along the data, so nothing follows."""
+        poller = _poller(self.port.sockets())
+        deadline = time.monotonic() + DRAIN_LIMIT_S
+        while time.monotonic() < deadline and poller.poll(DRAIN_QUIET_MS):
+            self.port.service()
+            self.runner.take_messages()
+            self.port.flush()
 
     def _timeout_ms(self, next_diagnostics: float) -> int:
         runner = self.runner

@@ -44,6 +44,7 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
     """Stores scans, parameters, missing scans and notes; acknowledges each."""
 
     parameters_type = DatabaseWriterParameters
+    drains = True
 
     def __init__(self, context: NodeContext, parameters: DatabaseWriterParameters) -> None:
         super().__init__(context, parameters)

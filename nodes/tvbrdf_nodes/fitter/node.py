@@ -37,6 +37,7 @@ class FitterNode(Node[FitterParameters]):
     """Turns ``/scan/radiance`` into ``/scan/parameters``."""
 
     parameters_type = FitterParameters
+    drains = True
 
     @classmethod
     def topics(cls, name: str, parameters: FitterParameters) -> TopicUse:

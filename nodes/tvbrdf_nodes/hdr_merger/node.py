@@ -8,6 +8,7 @@ how it arrived. So a refit of what was recorded equals the live run.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tvbrdf_messages.envelope import Envelope
@@ -42,6 +43,11 @@ class HdrMergerParameters:
     """Of the frames, where it is not the calibration's."""
     correct_motion_blur: bool = True
     """Frames average over the light's way during their exposure; only a simulation may not."""
+
+    def __post_init__(self) -> None:
+        """Refuse a calibration that is not there, before anything starts."""
+        if not Path(self.calibration).is_file():
+            raise ValueError(f"calibration {self.calibration} is no file; give the rig's own")
 
 
 class HdrMergerNode(Node[HdrMergerParameters]):

@@ -41,6 +41,7 @@ class WorldParameters:
             raise ValueError("speedup must be 0 (no cap) or more, the others above 0")
         if not 1 <= self.step_ms <= 1000:
             raise ValueError(f"step_ms is {self.step_ms}, expected 1 to 1000")
+        load_scene(self.sample, self.effects, self.seed)  # what is missing is told before the start
 
 
 class WorldNode(Node[WorldParameters]):
