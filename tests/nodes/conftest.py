@@ -33,6 +33,7 @@ from tvbrdf_nodes.core.loading import load_class, node_class_path
 from tvbrdf_nodes.core.node import Exit, Reply
 from tvbrdf_nodes.core.parameters import build
 
+CALIBRATION = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
 START_NS = 1_800_000_000_000_000_000
 M = TypeVar("M", bound=Message)
 
@@ -103,10 +104,10 @@ class Player:
 class Stage:
     """Runs some nodes of a graph; time goes on only when the test says so."""
 
-    def __init__(self, folder: Path, parts: list[Part]) -> None:
+    def __init__(self, folder: Path, parts: list[Part], utc_ns: int) -> None:
         graph = Graph(
             directory=str(folder),
-            utc_ns=START_NS,
+            utc_ns=utc_ns,
             monotonic_ns=0,
             simulated=False,
             participants=tuple(participant(part) for part in parts),
@@ -197,8 +198,8 @@ def make_stage(tmp_path: Path) -> Iterator[MakeStage]:
     """Give a function that makes a stage of parts, tuples as :class:`Part`."""
     made: list[Stage] = []
 
-    def make(*parts: tuple[Any, ...]) -> Stage:
-        made.append(Stage(tmp_path, [Part(*part) for part in parts]))
+    def make(*parts: tuple[Any, ...], utc_ns: int = START_NS) -> Stage:
+        made.append(Stage(tmp_path, [Part(*part) for part in parts], utc_ns))
         return made[-1]
 
     yield make
@@ -239,7 +240,7 @@ class Rig:
             "lamp_settle_s": LAMP_SETTLE_S,
             "answer_limit_s": 30.0,
         } | parameters
-        merging = {"calibration": "none", "cameras": CAMERAS}
+        merging = {"calibration": str(CALIBRATION), "cameras": CAMERAS}
         driver = "tvbrdf_nodes.camera.simulated:SimulatedCamera"
         self.stage: Stage = make_stage(
             ("arm", "arm"),
