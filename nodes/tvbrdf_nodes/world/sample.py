@@ -222,7 +222,8 @@ class MeasuredSample:
     """Reflectance in the published layout: scan k of a run shows the k-th scan on file.
 
     Between the light positions of a camera's file the radiance is a cubic spline; across a gap (the
-    arm hid the sample) and towards the sample's horizon it is linear.
+    arm hid the sample) it is linear, and so it goes on from the last position to the sample's
+    horizon, where it ends.
 
     Parameters
     ----------
@@ -257,8 +258,10 @@ class MeasuredSample:
         if curve is None or known != number:
             curve = self._read(number, camera)
             self._curves[camera] = (number, curve)
-        inside = np.clip(light_angle_deg, *HORIZONS_DEG)
-        return np.asarray(np.maximum(curve(inside), 0.0))
+        low, high = HORIZONS_DEG
+        inside = (light_angle_deg > low) & (light_angle_deg < high)
+        values = np.maximum(curve(np.clip(light_angle_deg, low, high)), 0.0)
+        return np.where(inside[:, None], values, 0.0)
 
     def _read(self, number: int, camera: int) -> PPoly:
         from tvbrdf_fitting.published import PublishedFormatError, read_scan_file, scan_file_name
@@ -289,10 +292,11 @@ class MeasuredSample:
 
 
 def piecewise_cubic(angle_deg: FloatArray, values: FloatArray) -> PPoly:
-    """Return a curve through ``values`` (n, 3) at rising angles (n,), 0 at both horizons.
+    """Return a curve through ``values`` (n, 3) at rising angles (n,), from horizon to horizon.
 
     A cubic spline where the positions are dense, linear where they are more than twice their
-    usual distance apart.
+    usual distance apart. Beyond the first and last it goes on straight for that distance (nothing
+    says that the curve bends there), and from there, if that is not the horizon yet, straight to 0.
 
     Raises
     ------
@@ -304,16 +308,32 @@ def piecewise_cubic(angle_deg: FloatArray, values: FloatArray) -> PPoly:
     steps = np.diff(angle_deg)
     if angle_deg.size < 2 or steps.min() <= 0:
         raise ValueError("needs two or more light positions, each at an angle of its own")
-    edges = [0, *(np.flatnonzero(steps > 2.0 * np.median(steps)) + 1), angle_deg.size]
-    ends = [np.array([horizon]) for horizon in HORIZONS_DEG]
-    points = np.concatenate([ends[0], angle_deg, ends[1]])
-    padded = np.concatenate([np.zeros((1, 3)), values, np.zeros((1, 3))])
+    step = float(np.median(steps))
+    edges = [0, *(np.flatnonzero(steps > 2.0 * step) + 1), angle_deg.size]
+    before = _beyond(angle_deg, values, step, HORIZONS_DEG[0])
+    after = _beyond(angle_deg[::-1], values[::-1], step, HORIZONS_DEG[1])
+    points = np.concatenate([before[0][::-1], angle_deg, after[0]])
+    padded = np.concatenate([before[1][::-1], values, after[1]])
     # all cells linear first, then those between dense positions from their spline
     coefficients = np.zeros((4, points.size - 1, 3))
     coefficients[2] = np.diff(padded, axis=0) / np.diff(points)[:, None]
     coefficients[3] = padded[:-1]
+    shift = before[0].size
     for first, last in pairwise(edges):
         if last - first >= 4:
             spline = CubicSpline(angle_deg[first:last], values[first:last])
-            coefficients[:, first + 1 : last] = spline.c
+            coefficients[:, first + shift : last + shift - 1] = spline.c
     return PPoly(coefficients, points)
+
+
+def _beyond(
+    angle_deg: FloatArray, values: FloatArray, step_deg: float, horizon_deg: float
+) -> tuple[FloatArray, FloatArray]:
+    """Angles (1 or 2,) and values from the first position on to the horizon, outwards."""
+    way = horizon_deg - angle_deg[0]
+    slope = (values[1] - values[0]) / (angle_deg[1] - angle_deg[0])
+    reach = float(np.sign(way)) * min(step_deg, abs(way))
+    straight = np.maximum(values[0] + slope * reach, 0.0)
+    if abs(way) <= step_deg * (1.0 + 1e-9):
+        return np.array([horizon_deg]), straight[None]
+    return np.array([angle_deg[0] + reach, horizon_deg]), np.stack([straight, np.zeros(3)])
