@@ -218,6 +218,7 @@ def test_the_test_can_play_a_participant_and_let_it_die_and_return(
         second.close()
         third = run.bus.port("reader")
         assert [e.message for e in third.receive()] == [Mark(text="1")]
+        run.step()
     assert [what for name, what, _ in notes if what.startswith("reader")] == ["reader reader"] * 3
 
 

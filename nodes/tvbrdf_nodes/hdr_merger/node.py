@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from tvbrdf_fitting.frame_reduction import FrameReducer
     from tvbrdf_fitting.scan_merge import FrameRecord, ScanObservations, SweepObservations
 
-KEPT_STATES = 20_000
-"""Of the arm: far more than a sweep has."""
+KEPT_STATES = 4_000
+"""Of the arm: several sweeps."""
 KEPT_SWEEPS, KEPT_COMMANDS = 12, 1000
 """Sweeps that were given up stay until their scan or a later one is published, or these are."""
 
@@ -314,7 +314,11 @@ class HdrMergerNode(Node[HdrMergerParameters]):
 
     def diagnostics(self) -> dict[str, Any]:
         """See :class:`~tvbrdf_nodes.core.node.Node`."""
-        return {"frames": self._frames, "unstored": len(self._unstored)}
+        return {
+            "frames": self._frames,
+            "unstored": len(self._unstored),
+            "open_sweeps": len(self._sweeps),
+        }
 
 
 def _keep_last(kept: dict[Any, Any], count: int) -> None:

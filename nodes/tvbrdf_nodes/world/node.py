@@ -30,7 +30,7 @@ class WorldParameters:
     """Cap on simulated over real time while all cameras watch; 0: as fast as the slowest."""
     idle_speedup: float = 40.0
     """Cap while nothing moves, so that people and nodes can follow."""
-    moving_speedup: float = 10.0
+    moving_speedup: float = 20.0
     """Cap while the arm moves but not all cameras watch: commands are on their way."""
     step_ms: float = 250.0
     """How far simulated devices may go ahead of the slowest."""

@@ -125,6 +125,17 @@ def run_rig() -> Iterator[RunRig]:
     shutil.rmtree(folder)
 
 
+@pytest.fixture(scope="session")
+def record() -> Iterator[Run]:
+    """One scan of two sweeps with everything that was published, as a bag would have it."""
+    folder = Path(tempfile.mkdtemp(prefix="tv"))
+    arguments = {"width": 16, "height": 16, "scans": 1, "warm_up_s": 1, "exposures_ms": [0.2, 4.0]}
+    try:
+        yield Run(folder, arguments, {}, keep_frames=True)
+    finally:
+        shutil.rmtree(folder)
+
+
 MakeSample = Callable[..., tuple[str, dict[str, float]]]
 
 
