@@ -76,6 +76,7 @@ def test_all_publishers_of_a_topic_are_watched(
         assert watcher.wait_connected(LIMIT_S)
         for port in ports:
             subscribed(port, "/operator/mark", watcher)
+        for port in ports:
             mark(port, f"from {port.name}")
         ports[0].publish("/scan/status", status(), stamp_ns=1)
         found = {}

@@ -32,7 +32,7 @@ SMALL: dict[str, Any] = {
     "height": 32,
     "warm_up_s": 1,
     "dark_frames": 3,
-    "interval_s": 20,
+    "interval_s": 60,
     "scans": 2,
 }
 T = TypeVar("T")

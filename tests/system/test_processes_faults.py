@@ -79,7 +79,7 @@ def test_an_arm_that_is_gone_for_good_ends_the_run_by_name(rig: Rig, kind: str, 
 
 
 def test_an_arm_that_is_unplugged_for_a_moment_goes_on(rig: Rig) -> None:
-    # idle simulated time runs 40 times as fast as the restart: leave it a long slot
+    # idle simulated time runs 20 times as fast as the restart: leave it a long slot
     status = launch(rig, arm=({"kind": "unplug", "for_s": 0.5, **MIDWAY},), interval_s=120)
     assert status == 0, rig.text()
     sample = rig.expect_whole_database()

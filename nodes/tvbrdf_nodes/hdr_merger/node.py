@@ -17,15 +17,23 @@ from tvbrdf_messages.topics import frame_topic
 
 from ..core.device import DeviceError
 from ..core.node import Node, NodeContext, Outputs, Release, Send, TopicUse
-from .sweep import ReducedFrame, Sweep, SweepError, SweepKey, check_complete, solve_sweep
+from .sweep import (
+    ReducedFrame,
+    Sweep,
+    SweepError,
+    SweepKey,
+    check_complete,
+    solve_sweep,
+    split_states,
+)
 
 if TYPE_CHECKING:
     from tvbrdf_fitting.calibration import Calibration
     from tvbrdf_fitting.frame_reduction import FrameReducer
     from tvbrdf_fitting.scan_merge import FrameRecord, ScanObservations, SweepObservations
 
-KEPT_STATES = 4_000
-"""Of the arm: several sweeps."""
+KEPT_STATES = 20_000
+"""Of the arm since its last sweep: those of a sweep of six minutes."""
 KEPT_SWEEPS, KEPT_COMMANDS = 12, 1000
 """Sweeps that were given up stay until their scan or a later one is published, or these are."""
 
@@ -115,8 +123,8 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             yield from self._take_frame(envelope, message)
         elif isinstance(message, ArmState):
             self._states.append(envelope)
-            if len(self._states) > 2 * KEPT_STATES:
-                del self._states[:KEPT_STATES]
+            if len(self._states) > KEPT_STATES:
+                del self._states[: KEPT_STATES // 10]
         elif isinstance(message, ScanCommand):
             yield from self._take_command(message)
         elif isinstance(message, SweepResult):
@@ -196,13 +204,16 @@ class HdrMergerNode(Node[HdrMergerParameters]):
     def _finish(self, key: SweepKey, sweep: Sweep, command: ScanCommand) -> Outputs:
         del self._sweeps[key]
         scan, number, _ = key
+        states, self._states = split_states(
+            self._states, sweep.results[self.parameters.arm], sweep.arm_incarnation
+        )
         try:
             check_complete(sweep, self._numbers)
             found = solve_sweep(
                 sweep,
                 key,
                 self._dark_frames(scan),
-                self._states,
+                states,
                 self._calibrated(),
                 self.parameters.arm,
                 correct_motion_blur=self.parameters.correct_motion_blur,
@@ -210,7 +221,6 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         except SweepError as error:
             yield self._result(key, "broken", str(error))
             return
-        self._states = self._states[-KEPT_STATES:]
         done = self._done.setdefault(scan, {})
         _keep_last(self._done, KEPT_SWEEPS)
         if number == 0:
@@ -318,6 +328,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             "frames": self._frames,
             "unstored": len(self._unstored),
             "open_sweeps": len(self._sweeps),
+            "kept_states": len(self._states),
         }
 
 

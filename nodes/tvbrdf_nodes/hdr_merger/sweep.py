@@ -53,28 +53,32 @@ def check_complete(sweep: Sweep, cameras: Mapping[str, int]) -> None:
             raise SweepError(f"{name} sent {result.frames} frames, {got} arrived")
 
 
-def solve_arm(
+def split_states(
     states: list[Envelope], result: SweepResult, incarnation: str
-) -> tuple[Any, float, dict[str, float]]:
-    """Return the light's path in a sweep, the deviation of its stamps (ns), and its clock.
+) -> tuple[list[Envelope], list[Envelope]]:
+    """Return the states that the arm counted to a sweep, by number, and those sent after them.
 
-    The states are those that the arm counted to the sweep, whenever they came.
+    ``states`` are in the order in which the arm's node, or its successor, sent them.
     """
+    chosen = {
+        envelope.header.sequence: (index, envelope)
+        for index, envelope in enumerate(states)
+        if envelope.header.incarnation == incarnation
+        and result.first_sequence <= envelope.header.sequence <= result.last_sequence
+    }
+    last = max((index for index, _ in chosen.values()), default=-1)
+    return [chosen[number][1] for number in sorted(chosen)], states[last + 1 :]
+
+
+def solve_arm(states: list[Envelope], result: SweepResult) -> tuple[Any, float, dict[str, float]]:
+    """Return the light's path in a sweep, the deviation of its stamps (ns), and its clock."""
     from tvbrdf_fitting.clock_model import ClockError, fit_clock
     from tvbrdf_fitting.light_path import LightPath
 
-    chosen = sorted(
-        {
-            envelope.header.sequence: envelope
-            for envelope in states
-            if envelope.header.incarnation == incarnation
-            and result.first_sequence <= envelope.header.sequence <= result.last_sequence
-        }.items()
-    )
-    if len(chosen) != result.last_sequence - result.first_sequence + 1:
+    if len(states) != result.last_sequence - result.first_sequence + 1:
         raise SweepError(f"{result.source}: states of the sweep are missing")
-    headers = [envelope.header for _, envelope in chosen]
-    arms = [m for _, e in chosen if isinstance(m := e.message, ArmState)]
+    headers = [envelope.header for envelope in states]
+    arms = [m for e in states if isinstance(m := e.message, ArmState)]
     delay_ns = arms[-1].one_way_delay_ns if arms else 0
     try:
         clock = fit_clock(
@@ -111,7 +115,7 @@ def solve_sweep(
     from tvbrdf_fitting.motion_blur import without_motion_blur
     from tvbrdf_fitting.scan_merge import FrameRecord, sweep_observations
 
-    path, arm_std_ns, arm_facts = solve_arm(states, sweep.results[arm], sweep.arm_incarnation)
+    path, arm_std_ns, arm_facts = solve_arm(states, sweep.results[arm])
     records: list[FrameRecord] = []
     stds_ns: dict[int, float] = {}
     facts: dict[str, Any] = {"arm": arm_facts}

@@ -28,7 +28,7 @@ class WorldParameters:
     seed: int = 1
     speedup: float = 0.0
     """Cap on simulated over real time while all cameras watch; 0: as fast as the slowest."""
-    idle_speedup: float = 40.0
+    idle_speedup: float = 20.0
     """Cap while nothing moves, so that people and nodes can follow."""
     moving_speedup: float = 20.0
     """Cap while the arm moves but not all cameras watch: commands are on their way."""

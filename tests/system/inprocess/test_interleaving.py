@@ -108,6 +108,7 @@ def effects(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_refit_equals_the_live_run_bit_for_bit(run_rig: RunRig, effects: Path) -> None:
     run = run_rig(effects=effects, scans=2, exposures_ms=[0.2, 4.0], keep_frames=True)
     tries = {(c.scan, c.sweep, c.attempt) for c in run.on("/scan/command") if c.action == "sweep"}
