@@ -1,4 +1,4 @@
-"""Nodes killed at any moment, several times in a run: each scan still ends exactly once."""
+"""Nodes killed at any moment, and runs that go on: each scan still ends exactly once."""
 
 from __future__ import annotations
 
@@ -49,3 +49,17 @@ def test_nodes_are_killed_at_any_moment(rig: Rig, seed: int) -> None:
     lives = {name: node.incarnations for name, node in rig.table().nodes.items()}
     assert {name for name, count in lives.items() if count > 1} == set(killed), rig.text()
     assert "Traceback" not in "".join(path.read_text() for path in rig.run.glob("*.log"))
+
+
+def test_time_goes_on_in_a_run_that_goes_on_with_another(rig: Rig) -> None:
+    """A simulated run's clock starts at the time of day, where the one before may be ahead."""
+    rig.launch(scans=2, interval_s=40)
+    assert rig.wait() == 0, rig.text()
+    first = [scan.time_s for scan in rig.sample().scans]
+    rig.launch(scans=3, interval_s=40, resume="true")
+    assert rig.wait() == 0, rig.text()
+    rig.expect_nothing_left()
+    times = [scan.time_s for scan in rig.expect_whole_database(3).scans]
+    assert times[:2] == first
+    # a scan begins when it is due, or a little later: commands take real time
+    assert 40.0 <= times[2] - times[1] < 50.0

@@ -165,6 +165,10 @@ class SimulatedCamera:
         """See :class:`.driver.CameraDriver`; frames begin after all that it has given or told."""
         self.stop()
         now_ns = max(self._horizon_ns, self._busy_until_ns)
+        if not tag.lamp and self._link is not None:
+            # the controller may be a step ahead, and the lamp off only from there
+            self._take_messages()
+            now_ns = max(now_ns, self._granted_ns)
         self._capture = _Capture(tag=tag, next_number=-1, busy_until_ns=now_ns)
         if self._world is not None:
             self._world.faults.begin()
