@@ -23,8 +23,6 @@ TOGETHER_BYTES = 16384
 """Small lossless messages wait for each other up to this size, or until :meth:`flush`."""
 COMMAND_CREDIT_BYTES = 8 << 20
 MESSAGE_OVERHEAD_BYTES = 64
-WATCH_QUEUE_BYTES = 16 << 20
-"""What may wait for a slow watcher; older messages are dropped for it."""
 # plain integers: arithmetic with pyzmq's enumerations takes longer than sending does
 DONTWAIT, SNDMORE, POLLIN = int(zmq.DONTWAIT), int(zmq.SNDMORE), int(zmq.POLLIN)
 _BROKEN = (
