@@ -1,37 +1,21 @@
-"""Reflectance models, one file each, and the one place where they are found by name."""
+"""Reflectance models, one file each, found by name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 
 from .base import Parameter, ReflectanceModel, Term, Transform
 from .combination import SumModel
 from .dust import DustForm, DustOverSurface
+from .lambert import Lambert
+from .lobe import Lobe
 from .oren_nayar import OrenNayar
+from .registry import Registration, build, label, registered, split
 from .torrance_sparrow import TorranceSparrow
 
 SURFACE = "oren_nayar+torrance_sparrow"
-DUST = "dust+oren_nayar+torrance_sparrow"
-
-
-def _surface() -> ReflectanceModel:
-    return SumModel([OrenNayar(), TorranceSparrow()])
-
-
-def _dust(form: DustForm) -> Callable[[], ReflectanceModel]:
-    return lambda: DustOverSurface(OrenNayar(), TorranceSparrow(), form)
-
-
-MODELS: dict[str, Callable[[], ReflectanceModel]] = {
-    "oren_nayar": OrenNayar,
-    "torrance_sparrow": TorranceSparrow,
-    SURFACE: _surface,
-    DUST: _dust("reciprocal"),
-    f"dust(paper)+{SURFACE}": _dust("paper"),
-    f"dust(blinn)+{SURFACE}": _dust("blinn"),
-}
-"""Every model by its full name, which is also what is recorded with fitted parameters."""
+DUST = f"dust+{SURFACE}"
+COLOURED = f"{SURFACE}(coloured)"
 ALIASES = {"ON+TS": SURFACE, "dust": DUST}
 
 
@@ -41,44 +25,60 @@ def get_model(name: str, *, form: DustForm | None = None) -> ReflectanceModel:
     Parameters
     ----------
     name
-        A name of `MODELS` or an alias: "ON+TS", "dust".
+        One model or a sum, ``"lambert"``, ``"oren_nayar+torrance_sparrow(coloured)"``, with options
+        in brackets; or an alias: "ON+TS", "dust". `registered()` lists the parts.
     form
-        For dust only: "reciprocal" (default), "paper" or "blinn"; see `models.dust`.
+        For the alias "dust" only: "reciprocal" (default), "paper" or "blinn"; see `models.dust`.
 
     Raises
     ------
     ValueError
-        Unknown name (the message lists the known ones), or a form for a model that has none.
+        Unknown name or option (the message lists the known ones), or a form for a model that has
+        none.
     """
     full = ALIASES.get(name, name)
     if form is not None:
         if full != DUST:
             raise ValueError(f"model {name!r} has no forms; only {DUST!r} has")
-        return _build(DustOverSurface(OrenNayar(), TorranceSparrow(), form).name)
+        full = DustOverSurface(OrenNayar(), TorranceSparrow(), form).name
     return _build(full)
 
 
 @cache
 def _build(name: str) -> ReflectanceModel:
-    if name not in MODELS:
-        known = ", ".join([*MODELS, *(f"{a} (= {full})" for a, full in ALIASES.items())])
-        raise ValueError(f"unknown model {name!r}; known models: {known}")
-    return MODELS[name]()
+    return build(name)
+
+
+@cache
+def catalogue() -> tuple[str, ...]:
+    """Return the names of every model with each of its options, and the sums in common use."""
+    names: list[str] = []
+    for entry in registered().values():
+        below = f"+{SURFACE}" if entry.over else ""
+        names += [label(entry.name) + below]
+        names += [label(entry.name, option) + below for option in entry.options]
+    return (*names, SURFACE, COLOURED)
 
 
 __all__ = [
     "ALIASES",
+    "COLOURED",
     "DUST",
-    "MODELS",
     "SURFACE",
     "DustForm",
     "DustOverSurface",
+    "Lambert",
+    "Lobe",
     "OrenNayar",
     "Parameter",
     "ReflectanceModel",
+    "Registration",
     "SumModel",
     "Term",
     "TorranceSparrow",
     "Transform",
+    "catalogue",
     "get_model",
+    "registered",
+    "split",
 ]

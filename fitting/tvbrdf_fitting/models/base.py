@@ -70,6 +70,8 @@ class Parameter:
         Internal values that a coarse search tries; empty for amplitudes.
     full_scale
         Standard deviation (internal) above which the data say nothing useful of the parameter.
+    typical
+        A published value as met in practice, for examples and checks.
     """
 
     name: str
@@ -81,6 +83,7 @@ class Parameter:
     carried_by: tuple[tuple[str, ...], ...] = ()
     grid: tuple[float, ...] = ()
     full_scale: float = math.inf
+    typical: float = 0.5
 
     @property
     def internal_name(self) -> str:
@@ -129,6 +132,14 @@ class ReflectanceModel(ABC):
     terms: tuple[Term, ...]
     confounded: tuple[tuple[str, str], ...] = ()
     """Pairs that data may be unable to tell apart; checked by their correlation after a fit."""
+    diffuse: bool = False
+    """True for what scatters below a layer of dust, False for a lobe on the surface."""
+    reciprocal: bool = True
+    """False where exchanging light and view changes the BRDF, by the model's definition."""
+    nonnegative: bool = True
+    """False where the formula itself can go below 0 within the bounds."""
+    delta: bool = False
+    """True for an ideal mirror or refraction: a renderer's, which no fit can use."""
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
@@ -139,6 +150,11 @@ class ReflectanceModel(ABC):
     def units(self) -> dict[str, str]:
         """Unit of each parameter."""
         return {p.name: p.unit for p in self.parameters}
+
+    @cached_property
+    def typical(self) -> FloatArray:
+        """Published values (p,) as met in practice."""
+        return np.array([p.typical for p in self.parameters])
 
     @cached_property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -226,6 +242,15 @@ class ReflectanceModel(ABC):
         out *= above
         out *= self.slopes(parameters)[:, None, None]
         return np.ascontiguousarray(out.transpose(2, 1, 0))
+
+    def refuse(self, light: FloatArray, view: FloatArray) -> str | None:
+        """Return why directions (n, 3) cannot determine this model's parameters, or None.
+
+        For what no fit of such data can see; what only noise hides is found by the covariance.
+        """
+        if self.delta:
+            return "an ideal mirror or refraction has no BRDF value that a camera could measure"
+        return None
 
     @abstractmethod
     def prepare(self, light: FloatArray, view: FloatArray) -> Any:

@@ -1,7 +1,8 @@
-"""Sums of models: a diffuse one and specular lobes, added."""
+"""Sums of models: a diffuse one and any number of specular lobes, added."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -9,27 +10,40 @@ from typing import Any
 import numpy as np
 
 from ..geometry import FloatArray
-from .base import ReflectanceModel, Term
+from .base import Parameter, ReflectanceModel, Term
 
 
 class SumModel(ReflectanceModel):
-    """The sum of several models' BRDFs; parameters are theirs, one model after the other."""
+    """The sum of several models' BRDFs; parameters are theirs, one model after the other.
+
+    Where two parts have parameters of the same name, the later ones get `_2`, `_3`: a second lobe
+    of one kind has `ks_2`, `inverse_sigma_s_2`.
+    """
 
     def __init__(self, parts: Sequence[ReflectanceModel]) -> None:
         self.parts = tuple(parts)
         self.name = "+".join(part.name for part in parts)
-        self.parameters = tuple(p for part in parts for p in part.parameters)
-        self.confounded = tuple(pair for part in parts for pair in part.confounded)
+        self.reciprocal = all(part.reciprocal for part in parts)
+        self.delta = any(part.delta for part in parts)
+        parameters: list[Parameter] = []
+        terms: list[Term] = []
+        confounded: list[tuple[str, str]] = []
         self.slices: list[slice] = []
-        start = 0
-        for part in self.parts:
-            self.slices.append(slice(start, start + len(part.parameters)))
-            start += len(part.parameters)
-        if len(set(self.parameter_names)) != len(self.parameters):
-            raise ValueError(f"{self.name}: two parts have parameters of the same name")
-        self.terms = tuple(
-            through(term, index) for index, part in enumerate(parts) for term in part.terms
-        )
+        seen: Counter[str] = Counter()
+        for index, part in enumerate(self.parts):
+            names = _unique_names(part, seen)
+            self.slices.append(slice(len(parameters), len(parameters) + len(part.parameters)))
+            parameters += [_renamed(p, names) for p in part.parameters]
+            terms += [_renamed_term(through(term, index), names) for term in part.terms]
+            confounded += [(names[one], names[other]) for one, other in part.confounded]
+        self.parameters = tuple(parameters)
+        self.terms = tuple(terms)
+        self.confounded = tuple(confounded)
+
+    def refuse(self, light: FloatArray, view: FloatArray) -> str | None:
+        """Return the first part's reason why these directions cannot determine it."""
+        reasons = (part.refuse(light, view) for part in self.parts)
+        return next((reason for reason in reasons if reason is not None), None)
 
     def prepare(self, light: FloatArray, view: FloatArray) -> tuple[Any, ...]:
         """Return each part's functions of the directions."""
@@ -57,3 +71,23 @@ def through(term: Term, index: int) -> Term:
         return term.vector(prepared[index], shapes, typical)
 
     return replace(term, vector=vector)
+
+
+def _unique_names(part: ReflectanceModel, seen: Counter[str]) -> dict[str, str]:
+    """Return the part's names as they are in the sum; all get the same number."""
+    number = 1 + max((seen[name] for name in part.parameter_names), default=0)
+    seen.update(part.parameter_names)
+    return {n: n if number == 1 else f"{n}_{number}" for n in part.parameter_names}
+
+
+def _renamed(parameter: Parameter, names: dict[str, str]) -> Parameter:
+    groups = tuple(tuple(names[name] for name in group) for group in parameter.carried_by)
+    return replace(parameter, name=names[parameter.name], carried_by=groups)
+
+
+def _renamed_term(term: Term, names: dict[str, str]) -> Term:
+    return replace(
+        term,
+        amplitudes=tuple(names[name] for name in term.amplitudes),
+        shapes=tuple(names[name] for name in term.shapes),
+    )

@@ -33,14 +33,15 @@ import numpy as np
 
 from ..geometry import FloatArray
 from .base import ARTANH, Parameter, ReflectanceModel, Term
-from .combination import through
+from .combination import SumModel, through
+from .registry import Registration
 
 DustForm = Literal["reciprocal", "paper", "blinn"]
 FORMS: tuple[str, ...] = get_args(DustForm)
 
 _W_FULL_SCALE = 1 / (4 * math.pi)  # single-scattering albedo 1
 _W = Parameter(
-    "w", "1/sr", 0.0, np.inf, carried_by=(("tau",),), full_scale=_W_FULL_SCALE
+    "w", "1/sr", 0.0, np.inf, carried_by=(("tau",),), full_scale=_W_FULL_SCALE, typical=0.06
 ).one_a_channel()
 W_NAMES = tuple(p.name for p in _W)
 _G = Parameter(
@@ -52,8 +53,11 @@ _G = Parameter(
     carried_by=(W_NAMES, ("tau",)),
     grid=tuple(math.atanh(g) for g in (-0.7, -0.35, 0.0, 0.35, 0.7)),
     full_scale=1.0,
+    typical=0.35,
 )
-_TAU = Parameter("tau", "1", 0.0, 50.0, grid=(0.02, 0.07, 0.2, 0.6, 1.5, 4.0), full_scale=10.0)
+_TAU = Parameter(
+    "tau", "1", 0.0, 50.0, grid=(0.02, 0.07, 0.2, 0.6, 1.5, 4.0), full_scale=10.0, typical=0.6
+)
 
 
 @dataclass(frozen=True)
@@ -83,9 +87,11 @@ class DustOverSurface(ReflectanceModel):
     ) -> None:
         if form not in FORMS:
             raise ValueError(f"dust has no form {form!r}; known forms: {', '.join(FORMS)}")
-        self.diffuse, self.specular, self.form = diffuse, specular, form
+        self.below, self.above, self.form = diffuse, specular, form
         label = "dust" if form == "reciprocal" else f"dust({form})"
         self.name = f"{label}+{diffuse.name}+{specular.name}"
+        self.reciprocal = form == "reciprocal" and diffuse.reciprocal and specular.reciprocal
+        self.nonnegative = diffuse.nonnegative and specular.nonnegative
         self.parameters = (*diffuse.parameters, *specular.parameters, *_W, _G, _TAU)
         diffuse_count = len(diffuse.parameters)
         self._surface = slice(0, diffuse_count + len(specular.parameters))
@@ -104,14 +110,14 @@ class DustOverSurface(ReflectanceModel):
     def prepare(self, light: FloatArray, view: FloatArray) -> tuple[Any, Any, Basis]:
         """Return the surface's and the dust's functions of the directions."""
         dust = _basis(light, view, light_weighted=self.form != "reciprocal")
-        return self.diffuse.prepare(light, view), self.specular.prepare(light, view), dust
+        return self.below.prepare(light, view), self.above.prepare(light, view), dust
 
     def value(self, prepared: tuple[Any, Any, Basis], internal: FloatArray) -> FloatArray:
         """BRDF (3, n)."""
         w, g, tau = self._dust_values(internal)
         dust = prepared[2]
-        diffuse = self.diffuse.value(prepared[0], internal[self._diffuse])
-        specular = self.specular.value(prepared[1], internal[self._specular])
+        diffuse = self.below.value(prepared[0], internal[self._diffuse])
+        specular = self.above.value(prepared[1], internal[self._specular])
         scattered = w[:, None] * (_opacity(dust.path, tau) * _phase(dust, g) * dust.factor)
         if self.form == "blinn":
             below = _transmission(dust.view_path, tau) * (diffuse + specular)
@@ -125,15 +131,15 @@ class DustOverSurface(ReflectanceModel):
         """Write the derivatives by the surface's coordinates, w, artanh(g) and tau."""
         w, g, tau = self._dust_values(internal)
         dust = prepared[2]
-        self.diffuse.add_jacobian(prepared[0], internal[self._diffuse], out[self._diffuse])
-        self.specular.add_jacobian(prepared[1], internal[self._specular], out[self._specular])
-        diffuse = self.diffuse.value(prepared[0], internal[self._diffuse])
+        self.below.add_jacobian(prepared[0], internal[self._diffuse], out[self._diffuse])
+        self.above.add_jacobian(prepared[1], internal[self._specular], out[self._specular])
+        diffuse = self.below.value(prepared[0], internal[self._diffuse])
         opacity, phase = _opacity(dust.path, tau), _phase(dust, g)
         unit = opacity * phase * dust.factor
         slope = -_transmission_slope(dust.path, tau) * phase * dust.factor
         first = self._surface.stop
         if self.form == "blinn":
-            specular = self.specular.value(prepared[1], internal[self._specular])
+            specular = self.above.value(prepared[1], internal[self._specular])
             out[self._surface] *= _transmission(dust.view_path, tau)
             below = _transmission_slope(dust.view_path, tau) * (diffuse + specular)
         else:
@@ -210,3 +216,27 @@ def _phase_slope(dust: Basis, g: float) -> FloatArray:
 def _dust_vector(prepared: Any, shapes: Sequence[float], _typical: float) -> FloatArray:
     dust: Basis = prepared[2]
     return _opacity(dust.path, shapes[1]) * _phase(dust, math.tanh(shapes[0])) * dust.factor
+
+
+def _over(*surface: ReflectanceModel, paper: bool = False, blinn: bool = False) -> DustOverSurface:
+    diffuse = [part for part in surface if part.diffuse]
+    specular = [part for part in surface if not part.diffuse]
+    if not (diffuse and specular) or list(surface) != diffuse + specular:
+        raise ValueError(
+            f"dust over {'+'.join(part.name for part in surface)}: below dust there are diffuse "
+            f"models, then specular ones, at least one of each, as in 'oren_nayar+torrance_sparrow'"
+        )
+    below, above = (p[0] if len(p) == 1 else SumModel(p) for p in (diffuse, specular))
+    return DustOverSurface(below, above, "paper" if paper else "blinn" if blinn else "reciprocal")
+
+
+REGISTERED = (
+    Registration(
+        "dust",
+        "layer: single scattering above a surface, which is seen attenuated",
+        _over,
+        options=("paper", "blinn"),
+        exclusive=(("paper", "blinn"),),
+        over=True,
+    ),
+)

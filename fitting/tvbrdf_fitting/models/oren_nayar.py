@@ -32,8 +32,10 @@ import numpy as np
 
 from ..geometry import FloatArray
 from .base import SQUARE, Parameter, ReflectanceModel, Term
+from .registry import Registration
 
-_KD = Parameter("kd", "1", 0.0, np.inf, full_scale=1.0).one_a_channel()
+KD = Parameter("kd", "1", 0.0, np.inf, full_scale=1.0)
+_KD = KD.one_a_channel()
 KD_NAMES = tuple(p.name for p in _KD)
 _SIGMA_D = Parameter(
     "sigma_d",
@@ -44,6 +46,7 @@ _SIGMA_D = Parameter(
     carried_by=(KD_NAMES,),
     grid=(0.0, 0.02, 0.07, 0.2, 0.6, 1.5),
     full_scale=2.25,
+    typical=0.4,
 )
 
 
@@ -59,6 +62,8 @@ class OrenNayar(ReflectanceModel):
     """The full model of 1994; parameters `kd_b, kd_g, kd_r, sigma_d`."""
 
     name = "oren_nayar"
+    diffuse = True
+    nonnegative = False
     parameters = (*_KD, _SIGMA_D)
 
     def __init__(self) -> None:
@@ -143,3 +148,8 @@ def _coefficient_slopes(s: float) -> tuple[float, float, float]:
 def _diffuse_vector(prepared: Basis, shapes: Sequence[float], typical_kd: float) -> FloatArray:
     c1, b, e = _coefficients(shapes[0])
     return np.asarray((c1 + b * prepared.g1 + (typical_kd * e) * prepared.g2) / np.pi)
+
+
+REGISTERED = (
+    Registration("oren_nayar", "diffuse: V-shaped Lambertian facets, full form", OrenNayar),
+)

@@ -26,12 +26,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry import FloatArray
-from .base import LOG, Parameter, ReflectanceModel, Term
+from .base import LOG, Parameter
+from .lobe import Lobe
+from .registry import Registration
 
 SIGMA_S_BOUNDS = (0.005, 1.5)
 _LARGEST_LOG = 300.0  # keeps (1/sigma_s)^2 finite when a solver steps far out
 
-_KS = Parameter("ks", "1/sr", 0.0, np.inf)
+KS = Parameter("ks", "1/sr", 0.0, np.inf, typical=0.8)
 _INVERSE_SIGMA_S = Parameter(
     "inverse_sigma_s",
     "1/rad",
@@ -41,6 +43,7 @@ _INVERSE_SIGMA_S = Parameter(
     carried_by=(("ks",),),
     grid=tuple(-np.linspace(math.log(SIGMA_S_BOUNDS[1]), math.log(SIGMA_S_BOUNDS[0]), 20)),
     full_scale=1.0,
+    typical=6.0,
 )
 
 
@@ -52,28 +55,33 @@ class Basis:
     theta_h: FloatArray
 
 
-class TorranceSparrow(ReflectanceModel):
-    """Gaussian facets with the V-cavity factor; parameters `ks, inverse_sigma_s`."""
+class TorranceSparrow(Lobe):
+    """Gaussian facets with the V-cavity factor; parameters `ks, inverse_sigma_s`.
 
-    name = "torrance_sparrow"
-    parameters = (_KS, _INVERSE_SIGMA_S)
+    Coloured, as metals and car paint are: `ks_b, ks_g, ks_r, inverse_sigma_s`.
+    """
 
-    def __init__(self) -> None:
-        self.terms = (Term(("ks",), ("inverse_sigma_s",), _lobe_vector),)
+    amplitude = KS
+    shapes = (_INVERSE_SIGMA_S,)
+
+    def __init__(self, *, coloured: bool = False) -> None:
+        super().__init__(coloured=coloured)
+        self.name = "torrance_sparrow(coloured)" if coloured else "torrance_sparrow"
 
     def prepare(self, light: FloatArray, view: FloatArray) -> Basis:
         """Return the functions of the directions that all parameter values share."""
         return basis(light, view)
 
-    def value(self, prepared: Basis, internal: FloatArray) -> FloatArray:
-        """BRDF (1, n), the same in all channels."""
-        return float(internal[0]) * _lobe(prepared, float(internal[1]))[0][None, :]
+    def lobe(self, prepared: Basis, shapes: Sequence[float]) -> FloatArray:
+        """D G / (4 cos cos) (n,) at log(1/sigma_s)."""
+        return _lobe(prepared, shapes[0])[0]
 
-    def add_jacobian(self, prepared: Basis, internal: FloatArray, out: FloatArray) -> None:
-        """Write the derivatives by Ks and log(1/sigma_s)."""
-        lobe, exponent = _lobe(prepared, float(internal[1]))
-        out[0] = lobe
-        out[1] = (-2.0 * float(internal[0])) * exponent * lobe
+    def lobe_slopes(
+        self, prepared: Basis, shapes: Sequence[float]
+    ) -> tuple[FloatArray, tuple[FloatArray]]:
+        """Return the lobe and its derivative by log(1/sigma_s)."""
+        lobe, exponent = _lobe(prepared, shapes[0])
+        return lobe, (-2.0 * exponent * lobe,)
 
 
 def basis(light: FloatArray, view: FloatArray) -> Basis:
@@ -95,5 +103,11 @@ def _lobe(prepared: Basis, log_inverse_sigma_s: float) -> tuple[FloatArray, Floa
     return prepared.factor * np.exp(-exponent), exponent
 
 
-def _lobe_vector(prepared: Basis, shapes: Sequence[float], _typical: float) -> FloatArray:
-    return _lobe(prepared, shapes[0])[0]
+REGISTERED = (
+    Registration(
+        "torrance_sparrow",
+        "specular: Gaussian facets in V-cavities, no Fresnel factor",
+        TorranceSparrow,
+        options=("coloured",),
+    ),
+)
