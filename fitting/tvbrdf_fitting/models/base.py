@@ -138,6 +138,8 @@ class ReflectanceModel(ABC):
     """False where exchanging light and view changes the BRDF, by the model's definition."""
     nonnegative: bool = True
     """False where the formula itself can go below 0 within the bounds."""
+    isotropic: bool = True
+    """False where turning light and view together about the normal changes the BRDF."""
     delta: bool = False
     """True for an ideal mirror or refraction: a renderer's, which no fit can use."""
 
@@ -181,8 +183,8 @@ class ReflectanceModel(ABC):
             return np.array([p.transform.to_internal(v) for p, v in pairs])
         except ValueError:
             raise ValueError(
-                f"{self.name}: parameters {self.as_mapping(values)} are outside the model's domain "
-                f"(1/sigma_s > 0, |g| < 1)"
+                f"{self.name}: {self.as_mapping(values)} are outside the model's domain; "
+                f"its bounds are {self._bounds_in_words()}"
             ) from None
 
     def to_published(self, internal: ArrayLike) -> FloatArray:
@@ -270,6 +272,9 @@ class ReflectanceModel(ABC):
 
         Zeros that the model leaves are derivatives that vanish.
         """
+
+    def _bounds_in_words(self) -> str:
+        return ", ".join(f"{p.name} {p.lower:.4g} to {p.upper:.4g}" for p in self.parameters)
 
     def _values(self, values: ArrayLike) -> FloatArray:
         array = np.asarray(values, dtype=np.float64)

@@ -24,6 +24,8 @@ class SumModel(ReflectanceModel):
         self.parts = tuple(parts)
         self.name = "+".join(part.name for part in parts)
         self.reciprocal = all(part.reciprocal for part in parts)
+        self.nonnegative = all(part.nonnegative for part in parts)
+        self.isotropic = all(part.isotropic for part in parts)
         self.delta = any(part.delta for part in parts)
         parameters: list[Parameter] = []
         terms: list[Term] = []

@@ -18,8 +18,9 @@ change with tau and are fitted on their own. cos(gamma) = -l.v, so that g > 0 sc
 the other convention is g with its sign changed. w is no albedo: w = albedo / (4 pi), and energy is
 created above 1 / (2 pi). For small tau only the product w tau is seen.
 
-1 - T is taken as -expm1(-tau m), and Phi's denominator as (1 - |g|)^2 + 2 |g| q with
-q = |l + v|^2 / 2 for g >= 0 and |l - v|^2 / 2 for g < 0: no difference of nearly equal numbers.
+1 - T is taken as -expm1(-tau m), m the path length 1/mu_i + 1/mu_r, and Phi's denominator as
+(1 - |g|)^2 + 2 |g| q with q = |l + v|^2 / 2 for g >= 0 and |l - v|^2 / 2 for g < 0: no difference
+of nearly equal numbers.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from ..geometry import FloatArray
 from .base import ARTANH, Parameter, ReflectanceModel, Term
 from .combination import SumModel, through
 from .registry import Registration
+from .torrance_sparrow import chords
 
 DustForm = Literal["reciprocal", "paper", "blinn"]
 FORMS: tuple[str, ...] = get_args(DustForm)
@@ -62,13 +64,14 @@ _TAU = Parameter(
 
 @dataclass(frozen=True)
 class Basis:
-    """Functions of the directions (n,): path lengths, view path, dust factor, q for both signs."""
+    """Functions of the directions (n,): path lengths, dust factor, q for both signs of g, l.v."""
 
     path: FloatArray
     view_path: FloatArray
     factor: FloatArray
     q_forward: FloatArray
     q_backward: FloatArray
+    cosine: FloatArray
 
 
 class DustOverSurface(ReflectanceModel):
@@ -92,6 +95,8 @@ class DustOverSurface(ReflectanceModel):
         self.name = f"{label}+{diffuse.name}+{specular.name}"
         self.reciprocal = form == "reciprocal" and diffuse.reciprocal and specular.reciprocal
         self.nonnegative = diffuse.nonnegative and specular.nonnegative
+        self.isotropic = diffuse.isotropic and specular.isotropic
+        self.delta = diffuse.delta or specular.delta
         self.parameters = (*diffuse.parameters, *specular.parameters, *_W, _G, _TAU)
         diffuse_count = len(diffuse.parameters)
         self._surface = slice(0, diffuse_count + len(specular.parameters))
@@ -107,6 +112,10 @@ class DustOverSurface(ReflectanceModel):
             Term(W_NAMES, ("g", "tau"), _dust_vector),
         )
 
+    def refuse(self, light: FloatArray, view: FloatArray) -> str | None:
+        """Return why these directions cannot determine the surface below, or None."""
+        return self.below.refuse(light, view) or self.above.refuse(light, view)
+
     def prepare(self, light: FloatArray, view: FloatArray) -> tuple[Any, Any, Basis]:
         """Return the surface's and the dust's functions of the directions."""
         dust = _basis(light, view, light_weighted=self.form != "reciprocal")
@@ -120,9 +129,9 @@ class DustOverSurface(ReflectanceModel):
         specular = self.above.value(prepared[1], internal[self._specular])
         scattered = w[:, None] * (_opacity(dust.path, tau) * _phase(dust, g) * dust.factor)
         if self.form == "blinn":
-            below = _transmission(dust.view_path, tau) * (diffuse + specular)
+            below = _transmitted(diffuse + specular, dust.view_path, tau)
         else:
-            below = _transmission(dust.path, tau) * diffuse + specular
+            below = _transmitted(diffuse, dust.path, tau) + specular
         return np.asarray(scattered + below)
 
     def add_jacobian(
@@ -134,23 +143,23 @@ class DustOverSurface(ReflectanceModel):
         self.below.add_jacobian(prepared[0], internal[self._diffuse], out[self._diffuse])
         self.above.add_jacobian(prepared[1], internal[self._specular], out[self._specular])
         diffuse = self.below.value(prepared[0], internal[self._diffuse])
-        opacity, phase = _opacity(dust.path, tau), _phase(dust, g)
-        unit = opacity * phase * dust.factor
-        slope = -_transmission_slope(dust.path, tau) * phase * dust.factor
+        opacity, (phase, phase_slope) = _opacity(dust.path, tau), _phase_and_slope(dust, g)
+        thick = w[:, None] * (phase * dust.factor)
         first = self._surface.stop
         if self.form == "blinn":
             specular = self.above.value(prepared[1], internal[self._specular])
-            out[self._surface] *= _transmission(dust.view_path, tau)
-            below = _transmission_slope(dust.view_path, tau) * (diffuse + specular)
+            _transmit(out[self._surface], dust.view_path, tau)
+            out[first + 4] = _darkening(diffuse + specular, dust.view_path, tau)
+            out[first + 4] -= _darkening(thick, dust.path, tau)
         else:
-            out[self._diffuse] *= _transmission(dust.path, tau)
-            below = _transmission_slope(dust.path, tau) * diffuse
+            _transmit(out[self._diffuse], dust.path, tau)
+            out[first + 4] = _darkening(diffuse - thick, dust.path, tau)
+        dense = opacity * dust.factor
+        unit = dense * phase
         for channel in range(3):
             out[first + channel, channel] = unit
         # d g / d artanh(g) = 1 - g^2
-        turn = opacity * dust.factor * _phase_slope(dust, g) * ((1 - g) * (1 + g))
-        out[first + 3] = w[:, None] * turn
-        out[first + 4] = w[:, None] * slope + below
+        np.multiply(w[:, None], dense * phase_slope * ((1 - g) * (1 + g)), out=out[first + 3])
 
     def _dust_values(self, internal: FloatArray) -> tuple[FloatArray, float, float]:
         first = self._surface.stop
@@ -167,50 +176,70 @@ class DustOverSurface(ReflectanceModel):
             dust: Basis = prepared[2]
             path = dust.view_path if self.form == "blinn" else dust.path
             below = term.vector(prepared, shapes[:-1], typical)
-            return np.asarray(_transmission(path, shapes[-1]) * below)
+            return _transmitted(below, path, shapes[-1])
 
         return Term(term.amplitudes, (*term.shapes, "tau"), vector)
 
 
 def _basis(light: FloatArray, view: FloatArray, *, light_weighted: bool) -> Basis:
     cos_light, cos_view = light[:, 2], view[:, 2]
-    both, apart = light + view, light - view
     factor = (cos_light if light_weighted else 1.0) / (cos_light + cos_view)
+    chord = chords(light, view)
     return Basis(
         path=1 / cos_light + 1 / cos_view,
         view_path=1 / cos_view,
         factor=factor,
-        q_forward=0.5 * np.einsum("ij,ij->i", both, both),
-        q_backward=0.5 * np.einsum("ij,ij->i", apart, apart),
+        q_forward=0.5 * (chord.together + np.square(cos_light + cos_view)),
+        q_backward=0.5 * (chord.apart + np.square(cos_light - cos_view)),
+        cosine=chord.in_plane + cos_light * cos_view,
     )
 
 
 # For tau < 0, where an unbounded solver may step, the exponentials go on as their tangents.
-def _transmission(path: FloatArray, tau: float) -> FloatArray:
-    return np.exp(-tau * path) if tau >= 0 else 1 - tau * path
+def _transmit(values: FloatArray, path: FloatArray, tau: float) -> FloatArray:
+    """Multiply values by T in place. In halves: T may be too small for a number, T x value not."""
+    if tau < 0:
+        values *= 1 - tau * path
+        return values
+    half = np.exp((-0.5 * tau) * path)
+    values *= half
+    values *= half
+    return values
+
+
+def _transmitted(values: FloatArray, path: FloatArray, tau: float) -> FloatArray:
+    return _transmit(values.copy(), path, tau)
+
+
+def _darkening(values: FloatArray, path: FloatArray, tau: float) -> FloatArray:
+    """Return the derivative of T x values by tau."""
+    return _transmit(-path * values, path, max(tau, 0.0))
 
 
 def _opacity(path: FloatArray, tau: float) -> FloatArray:
     return -np.expm1(-tau * path) if tau >= 0 else tau * path
 
 
-def _transmission_slope(path: FloatArray, tau: float) -> FloatArray:
-    return -path * np.exp(-tau * path) if tau >= 0 else -path
+def _phase(dust: Basis, g: float) -> FloatArray:
+    base = _denominator(dust, g)
+    return np.asarray((1 - g) * (1 + g) / (base * np.sqrt(base)))
+
+
+def _phase_and_slope(dust: Basis, g: float) -> tuple[FloatArray, FloatArray]:
+    """Phi and its derivative by g."""
+    base, both = _denominator(dust, g), (1 - g) * (1 + g)
+    # g + l.v, which is also q - (1 - g): the one of the two that has its digits
+    if g >= 0:
+        turn = np.where(dust.q_forward < 0.5, dust.q_forward - (1 - g), dust.cosine + g)
+    else:
+        turn = np.where(dust.q_backward < 0.5, (1 + g) - dust.q_backward, dust.cosine + g)
+    power = 1 / (base * np.sqrt(base))
+    return both * power, power * (-2 * g - 3 * both * turn / base)
 
 
 def _denominator(dust: Basis, g: float) -> FloatArray:
     q = dust.q_forward if g >= 0 else dust.q_backward
     return np.asarray((1 - abs(g)) ** 2 + 2 * abs(g) * q)
-
-
-def _phase(dust: Basis, g: float) -> FloatArray:
-    return np.asarray((1 - g) * (1 + g) * _denominator(dust, g) ** -1.5)
-
-
-def _phase_slope(dust: Basis, g: float) -> FloatArray:
-    base = _denominator(dust, g)
-    turn = dust.q_forward - (1 - g) if g >= 0 else (1 + g) - dust.q_backward
-    return np.asarray(base**-1.5 * (-2 * g - 3 * (1 - g) * (1 + g) * turn / base))
 
 
 def _dust_vector(prepared: Any, shapes: Sequence[float], _typical: float) -> FloatArray:

@@ -37,7 +37,7 @@ from .registry import Registration
 KD = Parameter("kd", "1", 0.0, np.inf, full_scale=1.0)
 _KD = KD.one_a_channel()
 KD_NAMES = tuple(p.name for p in _KD)
-_SIGMA_D = Parameter(
+SIGMA_D = Parameter(
     "sigma_d",
     "rad",
     0.0,
@@ -64,7 +64,7 @@ class OrenNayar(ReflectanceModel):
     name = "oren_nayar"
     diffuse = True
     nonnegative = False
-    parameters = (*_KD, _SIGMA_D)
+    parameters = (*_KD, SIGMA_D)
 
     def __init__(self) -> None:
         self.terms = (Term(KD_NAMES, ("sigma_d",), _diffuse_vector),)
@@ -102,47 +102,46 @@ def basis(light: FloatArray, view: FloatArray) -> Basis:
     c < 0 as ``-cos^2(alpha)/(1 + sin(alpha)) + x (3 - 3 x + x^2)``, x = 1 - 2 beta/pi;
     ``1 - |c|`` as ``sin^2(dphi)/(1 + |c|)``; the tangent of the half sum as a quotient of sums.
     """
-    sine_light, sine_view = np.hypot(light[:, 0], light[:, 1]), np.hypot(view[:, 0], view[:, 1])
-    light_is_flatter = light[:, 2] < view[:, 2]
-    cos_a = np.where(light_is_flatter, light[:, 2], view[:, 2])
-    cos_b = np.where(light_is_flatter, view[:, 2], light[:, 2])
-    sin_a = np.where(light_is_flatter, sine_light, sine_view)
-    sin_b = np.where(light_is_flatter, sine_view, sine_light)
-    alpha, beta = np.arctan2(sin_a, cos_a), np.arctan2(sin_b, cos_b)
-
-    in_plane = light[:, 0] * view[:, 0] + light[:, 1] * view[:, 1]
-    across = light[:, 0] * view[:, 1] - light[:, 1] * view[:, 0]
-    # Where either direction is the normal, azimuth is undefined, and beta = 0 removes its terms.
-    product = sine_light * sine_view
-    safe = np.where(product > 0, product, 1.0)
-    cosine = np.where(product > 0, in_plane / safe, 0.0)
-    sine = np.where(product > 0, across / safe, 0.0)
-
+    (lx, ly, lz), (vx, vy, vz) = np.ascontiguousarray(light.T), np.ascontiguousarray(view.T)
+    # tilts below 1e-154 underflow to 0, and make no difference
+    sine_light, sine_view = np.sqrt(lx * lx + ly * ly), np.sqrt(vx * vx + vy * vy)
+    cos_a, cos_b = np.minimum(lz, vz), np.maximum(lz, vz)
+    sin_a, sin_b = np.maximum(sine_light, sine_view), np.minimum(sine_light, sine_view)
     x = np.arctan2(cos_b, sin_b) * (2 / np.pi)
-    bracket = x * (3 - 3 * x + x * x) - cos_a * cos_a / (1 + sin_a)
-    same_side = in_plane / cos_b
-    other_side = cosine * (sin_b / cos_b) * bracket
+    # in units of pi/2; where beta is small its digits do not count beside C1
+    alpha, beta = np.arctan2(sin_a, cos_a) * (2 / np.pi), 1 - x
+
+    in_plane = lx * vx + ly * vy
+    # Where either direction is the normal, azimuth is undefined, and beta = 0 removes its terms.
+    product = np.maximum(sin_a * sin_b, 1e-150)
+    cosine, sine = in_plane / product, (lx * vy - ly * vx) / product
+
+    bracket = x * (3 - x * (3 - x)) - cos_a * cos_a / (1 + sin_a)
+    single = np.where(cosine < 0, cosine * sin_b * bracket, in_plane) * (0.45 / cos_b)
     half_sum = (sin_a + sin_b) / (cos_a + cos_b)
-    one_less_cosine = sine * sine / (1 + np.abs(cosine))
-    g1 = 0.45 * np.where(cosine < 0, other_side, same_side)
-    g1 += 0.125 * one_less_cosine * (4 * alpha * beta / np.pi**2) ** 2 * half_sum
-    g2 = 1 - cosine * (2 * beta / np.pi) ** 2
-    return Basis(g1, g2)
+    single += 0.125 * (sine * sine) / (1 + np.abs(cosine)) * np.square(alpha * beta) * half_sum
+    return Basis(single, 1 - cosine * (beta * beta))
+
+
+def single_bounce(s: float, constant: float = 0.33) -> tuple[float, float]:
+    """C1 and B at s = sigma_d^2; for s < 0, where a solver may step, their tangents."""
+    if s < 0:
+        return 1 - 0.5 * s / constant, s / 0.09
+    return 1 - 0.5 * s / (s + constant), s / (s + 0.09)
+
+
+def single_bounce_slopes(s: float, constant: float = 0.33) -> tuple[float, float]:
+    """Return the derivatives of C1 and B by s."""
+    s = max(s, 0.0)
+    return -0.5 * constant / (s + constant) ** 2, 0.09 / (s + 0.09) ** 2
 
 
 def _coefficients(s: float) -> tuple[float, float, float]:
-    if s < 0:  # tangents: a solver may step here, where the quotients have poles
-        return 1 - 0.5 * s / 0.33, s / 0.09, 0.17 * s / 0.13
-    return 1 - 0.5 * s / (s + 0.33), s / (s + 0.09), 0.17 * s / (s + 0.13)
+    return *single_bounce(s), 0.17 * s / (max(s, 0.0) + 0.13)
 
 
 def _coefficient_slopes(s: float) -> tuple[float, float, float]:
-    s = max(s, 0.0)
-    return (
-        -0.5 * 0.33 / (s + 0.33) ** 2,
-        0.09 / (s + 0.09) ** 2,
-        0.17 * 0.13 / (s + 0.13) ** 2,
-    )
+    return *single_bounce_slopes(s), 0.17 * 0.13 / (max(s, 0.0) + 0.13) ** 2
 
 
 def _diffuse_vector(prepared: Basis, shapes: Sequence[float], typical_kd: float) -> FloatArray:

@@ -14,6 +14,9 @@ v.h = |H| / 2 for unit vectors, ::
 
     G / (4 cos cos) = min(1 / (4 cos(theta_i) cos(theta_r)),  H_z / (|H|^2 max(cos, cos)))
 
+H is not added up from components, which loses up to 9 digits where light and view graze from
+opposite sides: see `chords`.
+
 D is not normalised: Ks > 1 is legal (albedo at normal incidence is about Ks pi sigma_s^2).
 """
 
@@ -31,6 +34,7 @@ from .lobe import Lobe
 from .registry import Registration
 
 SIGMA_S_BOUNDS = (0.005, 1.5)
+_TINY = 1e-150  # for denominators that vanish with their numerators
 _LARGEST_LOG = 300.0  # keeps (1/sigma_s)^2 finite when a solver steps far out
 
 KS = Parameter("ks", "1/sr", 0.0, np.inf, typical=0.8)
@@ -86,21 +90,61 @@ class TorranceSparrow(Lobe):
 
 def basis(light: FloatArray, view: FloatArray) -> Basis:
     """Geometric factor and theta_h (n,) for unit directions (n, 3) above the horizon."""
-    half = light + view
-    squared = np.einsum("ij,ij->i", half, half)
-    cos_light, cos_view = light[:, 2], view[:, 2]
-    shadowed = half[:, 2] / (squared * np.maximum(cos_light, cos_view))
+    together, cos_light, cos_view = chords(light, view).together, light[:, 2], view[:, 2]
+    height = cos_light + cos_view
+    squared = together + height * height
+    shadowed = height / (squared * np.maximum(cos_light, cos_view))
     factor = np.minimum(0.25 / (cos_light * cos_view), shadowed)
     # arctan2 keeps its digits where theta_h is small; arccos loses half of them
-    theta_h = np.arctan2(np.hypot(half[:, 0], half[:, 1]), half[:, 2])
-    return Basis(factor, theta_h)
+    return Basis(factor, np.arctan2(np.sqrt(together), height))
+
+
+def half_vector(light: FloatArray, view: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Radius |H_xy| and height H_z (n,) of H = l + v, with the digits that `chords` keeps."""
+    return np.sqrt(chords(light, view).together), light[:, 2] + view[:, 2]
+
+
+@dataclass(frozen=True)
+class Chords:
+    """|l_xy + v_xy|^2, |l_xy - v_xy|^2 and l_xy . v_xy (n,)."""
+
+    together: FloatArray
+    apart: FloatArray
+    in_plane: FloatArray
+
+
+def chords(light: FloatArray, view: FloatArray) -> Chords:
+    """Squared sum and difference of the directions (n, 3) in the sample's plane.
+
+    Sums of components would lose digits where the two nearly cancel: they carry the rounding of
+    the vectors' lengths, 1e-16, against a sum of 1e-12 where both graze from opposite sides. Here
+    ``|l_xy +- v_xy|^2 = (sin_i - sin_r)^2 + 2 sin_i sin_r (1 +- c)``, c the cosine of the azimuths'
+    difference; ``1 - |c| = sin^2 / (1 + |c|)``; the sines' difference is, at grazing,
+    ``(cos_r - cos_i)(cos_r + cos_i) / (sin_i + sin_r)``.
+    """
+    (lx, ly, lz), (vx, vy, vz) = np.ascontiguousarray(light.T), np.ascontiguousarray(view.T)
+    sine_light, sine_view = np.sqrt(lx * lx + ly * ly), np.sqrt(vx * vx + vy * vy)
+    sines, cosines = sine_light + sine_view, lz + vz
+    by_cosines = (vz - lz) * cosines / np.maximum(sines, _TINY)
+    difference = np.where(sines > cosines, by_cosines, sine_light - sine_view)
+    in_plane, across = lx * vx + ly * vy, lx * vy - ly * vx
+    more = sine_light * sine_view + np.abs(in_plane)
+    less = across * across / np.maximum(more, _TINY)
+    square, opposite = difference * difference, in_plane < 0
+    return Chords(
+        together=square + 2 * np.where(opposite, less, more),
+        apart=square + 2 * np.where(opposite, more, less),
+        in_plane=in_plane,
+    )
 
 
 def _lobe(prepared: Basis, log_inverse_sigma_s: float) -> tuple[FloatArray, FloatArray]:
     inverse = math.exp(min(log_inverse_sigma_s, _LARGEST_LOG))
-    # beyond 1e3 the exponential is 0 anyway, and 0 x inf in the derivative must not arise
-    exponent = np.minimum(np.square(prepared.theta_h * inverse), 1e3)
-    return prepared.factor * np.exp(-exponent), exponent
+    # beyond 2e3 both halves are 0 anyway, and 0 x inf in the derivative must not arise
+    exponent = np.minimum(np.square(prepared.theta_h * inverse), 2e3)
+    # in halves: where the factor is large, the product is a number when exp(-exponent) is not yet
+    half = np.exp(-0.5 * exponent)
+    return prepared.factor * half * half, exponent
 
 
 REGISTERED = (
