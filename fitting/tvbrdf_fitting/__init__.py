@@ -9,21 +9,26 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .batch import ParameterBatch, fit_parameters
     from .error_measures import ErrorMeasures, measure_errors, pool
     from .fit import fit_scan
+    from .many_scans import fit_scans
     from .models import get_model
+    from .nuisances import CommonErrors
     from .observations import Observations
     from .problem import FitError
     from .result import FitResult
-    from .uncertainty import CommonErrors
 
 _MODULES = {
-    "CommonErrors": "uncertainty",
+    "CommonErrors": "nuisances",
     "ErrorMeasures": "error_measures",
     "FitError": "problem",
     "FitResult": "result",
     "Observations": "observations",
+    "ParameterBatch": "batch",
+    "fit_parameters": "batch",
     "fit_scan": "fit",
+    "fit_scans": "many_scans",
     "get_model": "models",
     "measure_errors": "error_measures",
     "pool": "error_measures",
@@ -35,7 +40,10 @@ __all__ = [
     "FitError",
     "FitResult",
     "Observations",
+    "ParameterBatch",
+    "fit_parameters",
     "fit_scan",
+    "fit_scans",
     "get_model",
     "measure_errors",
     "pool",

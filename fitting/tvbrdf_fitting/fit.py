@@ -5,37 +5,38 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from .determined import bounds_reached, undetermined
 from .error_measures import measure_errors
 from .geometry import FloatArray
+from .losses import LOSSES, fit_reweighted
+from .marginal import Asked, Marginal, marginalise
+from .metrics import METRICS
 from .models import SURFACE, ReflectanceModel, get_model
+from .nuisances import CommonErrors, Nuisances, make_nuisances
 from .observations import Observations
 from .problem import FitError, Problem, Solution, Solver, make_problem
 from .result import FitResult
 from .solvers import SOLVERS
-from .uncertainty import (
-    CommonErrors,
-    bounds_reached,
-    estimate,
-    published_scale,
-    to_published,
-    undetermined,
-)
+from .uncertainty import estimate, published_scale, to_published
 
-MISFIT = 4.0
-"""Chi-square by degrees of freedom above which a model can't explain the data."""
-MISFIT_ROUNDS, MISFIT_AGREEMENT = 6, 0.02
+ScanFit = FitResult
 
 
 def fit_scan(
     observations: Observations,
     model: str | ReflectanceModel = SURFACE,
     *,
-    method: str = "paper",
+    method: str = "separable",
+    metric: str = "radiance",
+    loss: str = "least_squares",
     fixed: Mapping[str, float] | None = None,
     initial: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    tied: Mapping[str, str] | None = None,
     common_errors: CommonErrors | None = None,
     model_error: bool = True,
 ) -> FitResult:
@@ -43,8 +44,8 @@ def fit_scan(
 
     Where the model can't explain the data within their noise (`chi_square` a few times the degrees
     of freedom), noise alone would let the many precise, dark values decide everything and a peak
-    be missed. Then the model's own error, one standard deviation of radiance for all values, is
-    estimated from the residuals and added to the variances, until both agree.
+    be missed. Then the model's own error, one number for all values, is estimated from the
+    residuals and added to the variances, until both agree. `metric` says in what it is one number.
 
     Parameters
     ----------
@@ -53,22 +54,34 @@ def fit_scan(
     model
         Name for `get_model`, or a model.
     method
-        A name of `SOLVERS`: "paper" (Levenberg-Marquardt from a coarse search) or "trust_region".
+        A name of `SOLVERS`: "separable" (certain of the global optimum), "paper" or "trust_region".
+    metric
+        What counts as equal misfit: "radiance", "cosine_weighted", "relative" or "log" (see
+        `metrics`). Where noise explains the data they agree, but for what "log" leaves out.
+    loss
+        "least_squares", or for glints and stray frames "huber" or "cauchy" (see `losses`).
     fixed
         Published values that are known, by name: for dust w, g from pure dust, Kd and sigma_d from
         the clean surface, as the paper did.
     initial
         Published values to start from, by name, instead of the search's; one start then.
+    bounds
+        Narrower bounds than the model's, published units, by name; an infinite one stays as it is.
+    tied
+        Parameters that follow another one: {"kd_g": "kd_b", "kd_r": "kd_b"} is a grey surface.
+        (Lobes have an option for one amplitude or one a channel.)
     common_errors
-        Errors that frames share; adds `covariance_common`.
+        Errors that frames share: they become unknowns with a prior, and the parameters the most
+        probable ones (see `posterior`); adds `covariance_common` and `nuisances`.
     model_error
         False: weigh by the stated variances whatever the misfit.
 
     Raises
     ------
     FitError
-        Unknown method or parameter, a value out of bounds, fewer usable values than free
-        parameters.
+        Unknown method, metric, loss or parameter, a value out of bounds, a metric that needs the
+        model's error without it, directions that cannot determine the model, fewer usable values
+        than free parameters.
     ValueError
         Unknown model.
     """
@@ -76,48 +89,70 @@ def fit_scan(
     chosen = get_model(model) if isinstance(model, str) else model
     if method not in SOLVERS:
         raise FitError(f"unknown method {method!r}; known methods: {', '.join(SOLVERS)}")
-    problem = make_problem(observations, chosen, fixed or {}, initial or {})
-    solution = SOLVERS[method](problem)
-    misfit = 0.0
-    noise_only = problem
-    if model_error and 2 * problem.cost(solution.internal) > MISFIT * problem.degrees_of_freedom:
-        problem, solution, misfit = _fit_with_model_error(problem, solution, SOLVERS[method])
-    chi_square = 2 * noise_only.cost(solution.internal)
-    return _result(observations, problem, solution, common_errors, misfit, chi_square, began)
+    if loss not in LOSSES:
+        raise FitError(f"unknown loss {loss!r}; known losses: {', '.join(LOSSES)}")
+    if metric in {"cosine_weighted", "relative"} and not model_error:
+        raise FitError(f"metric {metric!r} weighs the model's error: it needs model_error=True")
+    problem = make_problem(
+        observations, chosen, fixed or {}, initial or {}, metric=metric, bounds=bounds, tied=tied
+    )
+    if problem.tied:
+        problem = _started_untied(problem, SOLVERS[method])
+    asked = Asked(SOLVERS[method], LOSSES[loss], model_error)
+    found = fit_reweighted(problem, asked.solve, asked.loss, model_error)
+    nuisances = make_nuisances(problem, observations, common_errors)
+    marginal = marginalise(found, problem, nuisances, asked)
+    result = _result(observations, nuisances, marginal)
+    return replace(
+        result,
+        **_followed(result, problem),
+        metric=metric,
+        loss=loss,
+        down_weighted=marginal.found.down_weighted,
+        tied=dict(tied or {}),
+        solve_time_s=time.perf_counter() - began,
+    )
 
 
-def _fit_with_model_error(
-    problem: Problem, solution: Solution, solve: Solver
-) -> tuple[Problem, Solution, float]:
-    """Add the residuals' spread to the variances and fit again, until the two agree."""
-    weighted = problem.weight > 0
-    variance = np.zeros(problem.weight.shape)
-    variance[weighted] = problem.weight[weighted] ** -2
-    spread = 0.0
-    current = problem
-    for _ in range(MISFIT_ROUNDS):
-        residual = (problem.predict(solution.internal) - problem.radiance)[weighted]
-        before, spread = spread, float(np.sqrt(np.mean(residual**2)))
-        if abs(spread - before) <= MISFIT_AGREEMENT * spread:
-            break
-        weight = np.zeros(problem.weight.shape)
-        weight[weighted] = 1.0 / np.sqrt(variance[weighted] + spread**2)
-        current = replace(problem, weight=weight)
-        solution = solve(current)
-    return current, solution, spread
+def _started_untied(problem: Problem, solve: Solver) -> Problem:
+    """Return a problem with tied parameters that starts from the answer without ties.
+
+    A coarse search takes each amplitude on its own; a leader starts at its group's mean.
+    """
+    followers = tuple(i for i in problem.tied if problem.tied[i] in problem.free)
+    alone = replace(problem, tied={}, free=tuple(sorted({*problem.free, *followers})))
+    internal = solve(alone).internal
+    start = {}
+    for index in problem.free:
+        group = [index, *(i for i in followers if problem.tied[i] == index)]
+        start[index] = float(np.mean(internal[group]))
+    return replace(problem, initial=start | dict(problem.initial))
 
 
-def _result(
-    observations: Observations,
-    problem: Problem,
-    solution: Solution,
-    common_errors: CommonErrors | None,
-    misfit: float,
-    chi_square: float,
-    began: float,
-) -> FitResult:
+def _followed(result: FitResult, problem: Problem) -> dict[str, Any]:
+    """Return the fields of a result in which tied parameters take after their leaders."""
+    if not problem.tied:
+        return {}
+    names = result.parameter_names
+    source = [problem.tied.get(i, i) for i in range(len(names))]
+    lost = {names[i] for i, leader in enumerate(source) if names[leader] in result.undetermined}
+    asked = {n for n in result.fixed if problem.tied.get(names.index(n)) not in problem.free}
+    return {
+        "values": _frozen(result.values[source]),
+        "internal_values": _frozen(result.internal_values[source]),
+        "undetermined": tuple(n for n in names if n in lost),
+        "fixed": tuple(n for n in names if n in asked),
+    } | {
+        name: _frozen(getattr(result, name)[np.ix_(source, source)])
+        for name in ("covariance_random", "covariance_common", "internal_covariance")
+    }
+
+
+def _result(observations: Observations, nuisances: Nuisances, marginal: Marginal) -> FitResult:
+    found, optimum = marginal.found, marginal.optimum
+    problem, solution = found.problem, found.solution
     model, internal = problem.model, solution.internal
-    uncertainty = estimate(problem, internal, observations, common_errors)
+    uncertainty = estimate(problem, nuisances, marginal.linearised)
     at_bound = bounds_reached(problem, internal)
     lost = undetermined(problem, internal, uncertainty, at_bound)
     unmeasured = [
@@ -141,16 +176,19 @@ def _result(
         undetermined=tuple(names[i] for i in lost),
         fixed=tuple(names[i] for i in sorted(problem.fixed)),
         errors=errors,
-        chi_square=chi_square,
+        chi_square=marginal.chi_square,
         degrees_of_freedom=problem.degrees_of_freedom,
-        model_error_std=misfit,
+        model_error_std=found.model_error_std,
         solver=solution.solver,
         reason=solution.reason,
         evaluations=solution.evaluations,
-        solve_time_s=time.perf_counter() - began,
+        solve_time_s=0.0,
         internal_names=model.internal_names,
         internal_values=_frozen(internal),
         internal_covariance=_frozen(uncertainty.random + uncertainty.common),
+        internal_bounds=_frozen(np.array([problem.lower, problem.upper])),
+        nuisances=nuisances.named(optimum.values, uncertainty.nuisance_deviations),
+        optimum=optimum,
     )
 
 
@@ -169,4 +207,15 @@ def _frozen(array: FloatArray) -> FloatArray:
     return array
 
 
-__all__ = ["SOLVERS", "CommonErrors", "FitError", "FitResult", "Solution", "Solver", "fit_scan"]
+__all__ = [
+    "LOSSES",
+    "METRICS",
+    "SOLVERS",
+    "CommonErrors",
+    "FitError",
+    "FitResult",
+    "ScanFit",
+    "Solution",
+    "Solver",
+    "fit_scan",
+]

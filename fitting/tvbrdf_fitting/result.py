@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,9 @@ from numpy.typing import ArrayLike
 from .error_measures import ErrorMeasures
 from .geometry import FloatArray
 from .models import get_model
+
+if TYPE_CHECKING:
+    from .marginal import Optimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,13 +29,16 @@ class FitResult:
     model
         Full name, which `get_model` takes; it also records the form of a dust model.
     parameter_names, values
-        (p,) fitted or fixed values; NaN for a channel that was not measured.
+        (p,) fitted or fixed values; NaN for a channel that was not measured. Where errors that
+        frames share were stated, they are the most probable ones, with those errors as unknowns
+        (unless the model is wrong, see `marginal`).
     covariance_random, covariance_common
         (p, p) from the errors of each value, and from errors that frames share (0 unless they were
-        stated). NaN for parameters the data say nothing of. sigma_d near 0 has a deviation that
-        covers the interval of sigma_d^2 (`uncertainty.published_scale`). With
-        `model_error_std` above 0 they belong to a model that is wrong: they say how well its best
-        values are defined, not how near the truth they are.
+        stated). Fits of scans with one calibration have the latter errors in common. NaN for
+        parameters the data say nothing of. sigma_d near 0 has a deviation that covers the interval
+        of sigma_d^2 (`uncertainty.published_scale`). With `model_error_std` above 0 they belong to
+        a model that is wrong: they say how well its best values are defined, not how near the
+        truth they are.
     at_bound
         Names of the free parameters that ended at a bound; deviations there are one-sided at best.
     undetermined
@@ -39,12 +46,14 @@ class FitResult:
     fixed
         Names of the parameters that were given.
     errors
-        Error measures over the usable observations.
+        Error measures over the usable observations, of the parameters alone, without `nuisances`.
     model_error_std
         Standard deviation of radiance that was added to the noise because the model can't explain
         the data without; 0 where it can. The chi-square is without it.
     chi_square, degrees_of_freedom
-        Sum of squared weighted residuals, and values less free parameters.
+        Sum of squared weighted residuals, and values less free parameters. Where errors that
+        frames share were stated, residuals are those that the nuisances leave, and their squares in
+        prior deviations are in the sum: each adds a term and an unknown.
     solver, reason, evaluations
         What ran, why it stopped, and how often it evaluated the model.
     solve_time_s
@@ -52,6 +61,22 @@ class FitResult:
     internal_names, internal_values, internal_covariance
         The coordinates fitted (sigma_d^2, log(1/sigma_s), artanh(g)) and their total covariance:
         there deviations are closest to normal.
+    internal_bounds
+        (2, p) lower and upper bounds of the fit in these coordinates.
+    nuisances
+        Errors that frames share as the fit found them, with the standard deviation that is left:
+        a gain's is relative, as in `gain_camera1_b`, `light_offset_sweep2_deg`, `plate_tilt_x_deg`.
+    metric
+        Of `metrics.METRICS`; `chi_square` and `model_error_std` are in it: for "log" and "relative"
+        the latter is relative, else in radiance (for "cosine_weighted" of light along the normal).
+    loss
+        Of `losses.LOSSES`.
+    down_weighted
+        Number of values that a robust loss gave less than half of their weight.
+    tied
+        Parameters that follow another one, by name.
+    optimum
+        Where the fit ended, for `interval`; not kept when a result is pickled or copied.
     """
 
     model: str
@@ -73,6 +98,16 @@ class FitResult:
     internal_names: tuple[str, ...]
     internal_values: FloatArray
     internal_covariance: FloatArray
+    internal_bounds: FloatArray
+    nuisances: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    metric: str = "radiance"
+    loss: str = "least_squares"
+    down_weighted: int = 0
+    tied: Mapping[str, str] = field(default_factory=dict)
+    optimum: Optimum | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"optimum": None}
 
     @property
     def covariance(self) -> FloatArray:
@@ -98,11 +133,38 @@ class FitResult:
 
     def value(self, name: str) -> float:
         """Return a parameter's value."""
-        return float(self.values[self._index(name)])
+        return float(self.values[self.index(name)])
 
     def standard_deviation(self, name: str) -> float:
         """Return a parameter's total standard deviation."""
-        return float(self.standard_deviations[self._index(name)])
+        return float(self.standard_deviations[self.index(name)])
+
+    def interval(self, name: str, sigmas: float = 3.0) -> tuple[float, float]:
+        """Return the ends of a parameter's interval, published units, in general not symmetric.
+
+        From the internal covariance where chi-square rises as that says, which takes two fits of
+        the other parameters; else, as near a bound or where the parameter is undetermined, from
+        the profile of chi-square, which takes some tens (see `profile_likelihood`). A fixed
+        parameter's is its value, that of one without any data all that the bounds allow.
+
+        Parameters
+        ----------
+        name
+            Of the parameter.
+        sigmas
+            Half the length in standard deviations, as if the errors were normal: 3 covers 99.73 %.
+
+        Raises
+        ------
+        KeyError
+            No such parameter.
+        ValueError
+            `sigmas` is not a positive number, or a profile is needed and the result no longer has
+            the data, as after pickling.
+        """
+        from .profile_likelihood import interval
+
+        return interval(self, name, sigmas)
 
     def brdf(self, light: ArrayLike, view: ArrayLike) -> FloatArray:
         """BRDF (n, 3) of the fitted model in 1/sr, B, G, R, for unit directions (n, 3)."""
@@ -136,9 +198,16 @@ class FitResult:
             "internal_names": list(self.internal_names),
             "internal_values": _plain(self.internal_values),
             "internal_covariance": _plain(self.internal_covariance),
+            "internal_bounds": _plain(self.internal_bounds),
+            "nuisances": {name: list(pair) for name, pair in self.nuisances.items()},
+            "metric": self.metric,
+            "loss": self.loss,
+            "down_weighted": self.down_weighted,
+            "tied": dict(self.tied),
         }
 
-    def _index(self, name: str) -> int:
+    def index(self, name: str) -> int:
+        """Return a parameter's place in `parameter_names`."""
         if name not in self.parameter_names:
             raise KeyError(f"{self.model} has no parameter {name!r}: {self.parameter_names}")
         return self.parameter_names.index(name)

@@ -1,4 +1,8 @@
-"""Solvers by name. A faster one is added by one more entry of `SOLVERS`.
+"""Solvers by name.
+
+``separable``, the default: compiled, for Oren-Nayar (or Lambert) with a Torrance-Sparrow lobe, in
+any metric that is linear in the radiance. What it can't fit is descended from several starts of a
+coarse search, by the project's own Levenberg-Marquardt, which knows bounds.
 
 ``paper``: MINPACK's Levenberg-Marquardt on all parameters at once, as Sun et al. did. It knows no
 bounds; where its answer leaves them, the offending coordinates are held at their bound and the
@@ -15,7 +19,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from . import separable
 from .geometry import FloatArray
+from .levenberg_marquardt import LeastSquaresSolution, levenberg_marquardt
 from .problem import Problem, Solution, Solver
 from .starts import find_starts, other_valleys
 
@@ -26,6 +32,7 @@ _FINE_STEPS = 100
 _ROUNDS = 12
 _SECOND_LOOKS = 2
 _LOOK_BUDGET = 80
+_GENERAL_TOLERANCE, _GENERAL_EVALUATIONS = 1e-9, 200
 
 
 @dataclass
@@ -132,7 +139,74 @@ def solve_trust_region(problem: Problem) -> Solution:
     return _trust_region(problem, find_starts(problem))
 
 
-SOLVERS: dict[str, Solver] = {"paper": solve_paper, "trust_region": solve_trust_region}
+def solve_separable(problem: Problem) -> Solution:
+    """Search every valley with compiled code where the model allows, else as `solve_general`."""
+    return separable.solve(problem) if separable.fits(problem) else solve_general(problem)
+
+
+def solve_general(problem: Problem) -> Solution:
+    """Descend every valley that a coarse search finds, for any model and metric, within bounds."""
+    run = _Descents(problem)
+    best = run.descend(find_starts(problem))
+    if not problem.initial:
+        for _ in range(_SECOND_LOOKS):
+            before = best.cost
+            best = run.descend(other_valleys(problem, run.whole(best.x)), best)
+            if best.cost >= before * (1 - 1e-7):
+                break
+    names = [problem.model.parameter_names[problem.free[i]] for i in best.held]
+    held = f", held at a bound: {', '.join(names)}" if names else ""
+    return Solution(
+        run.whole(best.x),
+        best.reason,
+        f"Levenberg-Marquardt from {run.descents} starts{held}",
+        run.evaluations,
+    )
+
+
+class _Descents:
+    """Descents of the general solver; counts what they cost."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.chosen = list(problem.free)
+        self.evaluations = 0
+        self.descents = 0
+
+    def whole(self, x: FloatArray) -> FloatArray:
+        point = self.problem.values.copy()
+        point[self.chosen] = x
+        return self.problem.whole(point)
+
+    def descend(
+        self, starts: list[FloatArray], best: LeastSquaresSolution | None = None
+    ) -> LeastSquaresSolution:
+        """Return the lowest of the descents from some starts, and of one that is known."""
+        problem = self.problem
+        for start in starts:
+            found = levenberg_marquardt(
+                lambda x: problem.residual(self.whole(x)),
+                lambda x: problem.jacobian(self.whole(x)),
+                start[self.chosen],
+                lower=problem.lower[self.chosen],
+                upper=problem.upper[self.chosen],
+                tolerance=_GENERAL_TOLERANCE,
+                max_evaluations=_GENERAL_EVALUATIONS,
+            )
+            self.evaluations += found.evaluations
+            self.descents += 1
+            if best is None or found.cost < best.cost:
+                best = found
+        if best is None:
+            raise AssertionError("a coarse search finds one start at least")
+        return best
+
+
+SOLVERS: dict[str, Solver] = {
+    "separable": solve_separable,
+    "paper": solve_paper,
+    "trust_region": solve_trust_region,
+}
 """Solvers by the name that `fit_scan(method=...)` takes."""
 
 

@@ -17,6 +17,7 @@ from .geometry import FloatArray, IntArray
 from .models import Term
 from .problem import Problem
 
+_UNSEEN = 1e-24
 _SWEEPS = 12
 """Coordinate descent rounds; the few, mostly local amplitudes need no more for a start."""
 
@@ -102,8 +103,9 @@ def _scan_lobe(
     shared = weighted @ basis
     square = energy - np.einsum("ij,ij->i", shared, shared)
     useful = square > 1e-9 * energy
-    best = np.where(useful, np.maximum(-(weighted @ rest), 0.0) / np.where(useful, square, 1.0), 0)
-    cost = 0.5 * float(rest @ rest) - 0.5 * square * best**2
+    downhill = np.where(useful, np.maximum(-(weighted @ rest), 0.0), 0.0)
+    best = downhill / np.where(useful, square, 1.0)
+    cost = 0.5 * float(rest @ rest) - 0.5 * downhill * best
     out = []
     for point in _local_minima(cost.reshape([len(g) for g in grids]), len(shapes)):
         k = int(np.ravel_multi_index(point, [len(g) for g in grids]))
@@ -224,7 +226,9 @@ def _nonnegative(
         if i not in moves:
             amplitudes[:, i] = problem.values[index]
     diagonal = np.einsum("kii->ki", gram)
-    safe = np.where(diagonal > 0, diagonal, 1.0)
+    # a lobe that no direction sees, far out in its tail, has no amplitude that means anything
+    seen = diagonal > _UNSEEN * diagonal.max(axis=0, initial=0.0)
+    safe = np.where(seen, diagonal, 1.0)
     if moves:
         # the unconstrained answer, ridged where vectors vanish, is mostly the final one
         sub = gram[:, moves][:, :, moves].copy()
@@ -233,12 +237,12 @@ def _nonnegative(
             sub[:, i, i] += ridge[:, i]
         held = np.einsum("kij,kj->ki", gram, amplitudes)[:, moves]
         solved = np.linalg.solve(sub, (projection[:, moves] - held)[..., None])[..., 0]
-        amplitudes[:, moves] = np.maximum(solved, 0.0)
+        amplitudes[:, moves] = np.where(seen[:, moves], np.maximum(solved, 0.0), 0.0)
     for _ in range(_SWEEPS):
         for i in moves:
             rest = np.einsum("kj,kj->k", gram[:, i], amplitudes) - diagonal[:, i] * amplitudes[:, i]
             better = np.maximum((projection[:, i] - rest) / safe[:, i], 0.0)
-            amplitudes[:, i] = np.where(diagonal[:, i] > 0, better, 0.0)
+            amplitudes[:, i] = np.where(seen[:, i], better, 0.0)
     return amplitudes
 
 

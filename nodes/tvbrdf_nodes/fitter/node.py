@@ -22,7 +22,7 @@ class FitterParameters:
     """What is fitted, and how."""
 
     model: str = "oren_nayar+torrance_sparrow"
-    method: str = "paper"
+    method: str = "separable"
     fixed: dict[str, Any] = field(default_factory=dict)
     """Published values that are known, by name (for dust: w, g, Kd and σd)."""
 
@@ -49,9 +49,11 @@ class FitterNode(Node[FitterParameters]):
 
     def prepare(self) -> None:
         """Load the solver, and refuse an unknown model or fixed parameter before anything moves."""
+        from tvbrdf_fitting import separable
         from tvbrdf_fitting.fit import fit_scan  # noqa: F401 - takes most of a second
         from tvbrdf_fitting.models import get_model
 
+        separable.compile_all()
         try:
             names = get_model(self.parameters.model).parameter_names
         except ValueError as error:
@@ -72,8 +74,8 @@ class FitterNode(Node[FitterParameters]):
 
     def _fit(self, radiance: Radiance) -> Parameters:
         from tvbrdf_fitting.fit import fit_scan
+        from tvbrdf_fitting.nuisances import CommonErrors
         from tvbrdf_fitting.problem import FitError
-        from tvbrdf_fitting.uncertainty import CommonErrors
 
         offsets = dict(enumerate(radiance.light_angle_std_deg.tolist()))
         common = CommonErrors(

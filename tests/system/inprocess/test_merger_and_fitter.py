@@ -383,7 +383,7 @@ def test_parameters_are_kept_until_they_are_stored(record: Run) -> None:
 @pytest.mark.parametrize(
     ("parameters", "text"),
     [
-        ({"model": "phong"}, "model: unknown model 'phong'; known models: oren_nayar"),
+        ({"model": "velvet"}, "model: unknown model 'velvet'; known models: cook_torrance"),
         ({"fixed": {"colour": 1.0}}, "fixed: colour: .* has kd_b, kd_g"),
     ],
 )

@@ -1,0 +1,246 @@
+"""The compiled solver against numpy, against many starts, and against the other solvers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tvbrdf_fitting import Observations, separable
+from tvbrdf_fitting.batch import fit_parameters
+from tvbrdf_fitting.models import COLOURED, SURFACE, get_model
+from tvbrdf_fitting.problem import FitError, Problem, make_problem
+from tvbrdf_fitting.separable import elementary, equations, search
+from tvbrdf_fitting.separable.layout import data_of, layout_of
+from tvbrdf_fitting.solvers import SOLVERS
+
+Simulate = Callable[..., Observations]
+
+FITTED = (
+    SURFACE,
+    COLOURED,
+    "lambert+torrance_sparrow",
+    "oren_nayar_short+torrance_sparrow",
+    "oren_nayar_short(interreflection)+torrance_sparrow(coloured)",
+    "lambert",
+    "oren_nayar",
+    "oren_nayar_short",
+    "torrance_sparrow",
+)
+NOT_FITTED = (
+    "dust",
+    "oren_nayar+torrance_sparrow+torrance_sparrow",
+    "lambert+oren_nayar",
+    "oren_nayar+phong",
+)
+
+
+def random_scene(rng: np.random.Generator) -> tuple[list[float], float, int]:
+    """Parameters of ON+TS, noise and step: also lobes that vanish or are narrower than a step."""
+    kd = np.exp(rng.uniform(np.log(0.01), np.log(0.95), 3))
+    sigma_d = rng.uniform(0, 1.2) * (rng.random() > 0.15)
+    ks = np.exp(rng.uniform(np.log(0.01), np.log(20))) * (rng.random() > 0.1)
+    sigma_s = np.exp(rng.uniform(np.log(0.006), np.log(1.2)))
+    noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.05))))
+    return [*kd, sigma_d, ks, 1 / sigma_s], noise, int(rng.choice([3, 8, 30]))
+
+
+def descended(problem: Problem, starts: np.ndarray) -> float:
+    """Lowest cost that the descent reaches from given coordinates."""
+    layout = layout_of(problem.model)
+    assert layout is not None
+    lower, upper = separable.limits(problem, layout)
+    vectors, f, q, radiance, weight = data = data_of(problem, layout)
+    diffuse = np.empty((3, 9))
+    for c in range(3):
+        equations.write_diffuse_products(weight[c], vectors, radiance[c], diffuse[c])
+    columns, blocks = np.empty((5, len(f))), equations.nearest(q)
+    costs = []
+    for start in starts:
+        x = np.clip(start, lower, upper)
+        found = search.descend(
+            x, layout.form, data, blocks, diffuse, lower, upper, columns, 1e-11, 300
+        )
+        costs.append(found[0])
+    return float(min(costs))
+
+
+def test_exponential_is_exact_to_one_and_a_half_units() -> None:
+    x = np.concatenate([np.linspace(0, 50, 20_001), np.geomspace(1e-300, 700, 5001)])
+    got = np.array([elementary.exp_negative(v) for v in x])
+    np.testing.assert_allclose(got, np.exp(-x), rtol=3.4e-16, atol=0)
+    assert elementary.exp_negative(1e300) < 1e-300
+
+
+@pytest.mark.parametrize("name", [SURFACE, COLOURED])
+def test_normal_equations_are_those_of_the_model(simulate: Simulate, name: str) -> None:
+    model = get_model(name)
+    problem = make_problem(simulate(model.typical, name, noise=0.02, step=9), model, {}, {})
+    layout = layout_of(model)
+    assert layout is not None
+    assert sorted(layout.where) == list(range(len(model.parameters)))
+    internal = model.to_internal(model.typical * 1.1)
+    x = internal[list(layout.where)]
+    size = len(x)
+    gradient, matrix, curvature = np.empty(size), np.empty((size, size)), np.empty((size, size))
+    data = data_of(problem, layout)
+    cost = equations.normal_equations(
+        x, layout.form, data, np.empty((5, len(data[1]))), gradient, matrix, curvature
+    )
+    jacobian = problem.jacobian(internal)[:, list(layout.where)]
+    residual = problem.residual(internal)
+    # sums of some thousand products: relative errors of a few hundred units in the last place
+    assert cost == pytest.approx(problem.cost(internal), rel=1e-13)
+    np.testing.assert_allclose(gradient, jacobian.T @ residual, rtol=1e-10)
+    np.testing.assert_allclose(matrix, jacobian.T @ jacobian, rtol=1e-10, atol=1e-9)
+    # the full second derivatives by (ks, u), by differences of the gradient
+    for k in range(4, size):
+        step, sides = 1e-6, []
+        for sign in (1, -1):
+            moved, side = x.copy(), np.empty(size)
+            moved[k] += sign * step
+            equations.normal_equations(
+                moved,
+                layout.form,
+                data,
+                np.empty((5, len(data[1]))),
+                side,
+                matrix,
+                curvature.copy(),
+            )
+            sides.append(side)
+        slope = (sides[0] - sides[1]) / (2 * step)
+        np.testing.assert_allclose(curvature[4:, k], slope[4:], rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_agrees_with_the_paper_s_solver(simulate: Simulate, name: str) -> None:
+    model = get_model(name)
+    problem = make_problem(simulate(model.typical, name, noise=0.01, step=6), model, {}, {})
+    assert separable.fits(problem)
+    ours, theirs = separable.solve(problem), SOLVERS["paper"](problem)
+    # MINPACK stops at relative steps of 1e-10, scaled by the parameters' effect
+    np.testing.assert_allclose(ours.internal, theirs.internal, rtol=1e-6, atol=1e-8)
+    assert problem.cost(ours.internal) <= problem.cost(theirs.internal) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("name", NOT_FITTED)
+def test_leaves_other_models_alone(simulate: Simulate, name: str) -> None:
+    problem = make_problem(simulate([0.3] * 3, "lambert", step=20), get_model(name), {}, {})
+    assert not separable.fits(problem)
+
+
+def test_fixed_parameters_stay(simulate: Simulate) -> None:
+    model = get_model(SURFACE)
+    observations = simulate(model.typical, noise=0.01, step=6)
+    fixed = {"sigma_d": 0.3, "kd_g": 0.45}
+    problem = make_problem(observations, model, fixed, {})
+    ours, theirs = separable.solve(problem), SOLVERS["trust_region"](problem)
+    assert model.to_published(ours.internal)[[1, 3]].tolist() == [0.45, 0.3]
+    np.testing.assert_allclose(ours.internal, theirs.internal, rtol=1e-4)
+    everything = make_problem(observations, model, model.as_mapping(model.typical), {})
+    np.testing.assert_allclose(
+        model.to_published(separable.solve(everything).internal), model.typical
+    )
+
+
+def test_finds_what_forty_starts_find(simulate: Simulate) -> None:
+    """200 scenes with vanishing, hidden and needle lobes, twelve lights to 120, up to 5 % noise."""
+    rng = np.random.default_rng(11)
+    model = get_model(SURFACE)
+    worse = []
+    for seed in range(200):
+        truth, noise, step = random_scene(rng)
+        observations = simulate(truth, noise=noise, seed=seed, step=step)
+        problem = make_problem(observations.select(observations.sweep == 2), model, {}, {})
+        starts = np.column_stack(
+            [
+                rng.uniform(0, 1, (40, 3)),
+                rng.uniform(0, 2.25, 40),
+                np.exp(rng.uniform(-4, 3, 40)),
+                rng.uniform(problem.lower[5], problem.upper[5], 40),
+            ]
+        )
+        cost = problem.cost(separable.solve(problem).internal)
+        if cost > descended(problem, starts) * (1 + 1e-6):
+            worse.append((truth, cost))
+    assert not worse
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_noise_free_parameters_come_back(simulate: Simulate, scale: float) -> None:
+    name = "lambert+torrance_sparrow"  # linear in its amplitudes, so a scale goes through exactly
+    model = get_model(name)
+    observations = simulate(model.typical, name, step=9)
+    scaled = replace(
+        observations,
+        radiance=observations.radiance * scale,
+        variance=observations.variance * scale**2,
+    )
+    problem = make_problem(scaled, model, {}, {})
+    values = model.to_published(separable.solve(problem).internal)
+    values[:4] /= scale
+    np.testing.assert_allclose(values, model.typical, rtol=1e-8)
+
+
+class TestBatch:
+    """Many scans that share their directions."""
+
+    def batch(self, simulate: Simulate, name: str = SURFACE) -> tuple[Observations, np.ndarray]:
+        observations = simulate(get_model(name).typical, name, noise=0.01, step=9)
+        rng = np.random.default_rng(5)
+        noise = np.sqrt(observations.variance) * rng.normal(size=(20, *observations.radiance.shape))
+        return observations, observations.radiance + noise
+
+    @pytest.mark.parametrize("jobs", [1, 3])
+    def test_is_what_single_fits_give(self, simulate: Simulate, jobs: int) -> None:
+        model = get_model(SURFACE)
+        observations, radiance = self.batch(simulate)
+        light, view = observations.light_direction, observations.view_direction
+        variance = np.where(observations.valid, observations.variance, np.inf)
+        alike = fit_parameters(light, view, radiance, variance, jobs=jobs)
+        each = fit_parameters(light, view, radiance, np.tile(variance, (20, 1, 1)), jobs=jobs)
+        np.testing.assert_allclose(alike.values, each.values, rtol=1e-9)
+        np.testing.assert_allclose(alike.chi_square, each.chi_square, rtol=1e-9)
+        assert alike.converged.all()
+        single = make_problem(replace(observations, radiance=radiance[7]), model, {}, {})
+        found = SOLVERS["separable"](single).internal
+        np.testing.assert_allclose(alike.values[7], model.to_published(found), rtol=1e-9)
+        assert alike.chi_square[7] == pytest.approx(2 * single.cost(found), rel=1e-9)
+
+    def test_other_models_go_the_long_way(self, simulate: Simulate) -> None:
+        name = "lambert+phong"
+        observations, radiance = self.batch(simulate, name)
+        variance = np.where(observations.valid, observations.variance, np.inf)
+        light, view = observations.light_direction, observations.view_direction
+        batch = fit_parameters(light, view, radiance[:3], variance, name)
+        np.testing.assert_allclose(batch.values.mean(0), get_model(name).typical, rtol=0.01)
+
+    def test_wrong_shapes_and_values_are_named(self, simulate: Simulate) -> None:
+        observations, radiance = self.batch(simulate)
+        light, view = observations.light_direction, observations.view_direction
+        variance = observations.variance
+        with pytest.raises(ValueError, match=r"radiance has shape .*, expected \(m, "):
+            fit_parameters(light, view, radiance[0], variance)
+        with pytest.raises(ValueError, match="variance has shape"):
+            fit_parameters(light, view, radiance, variance[:-1])
+        radiance[3, 4, 1] = np.nan
+        with pytest.raises(ValueError, match=r"radiance\[3, 4, 1\] is nan; .*infinite variance"):
+            fit_parameters(light, view, radiance, variance)
+        with pytest.raises(FitError, match="0 usable values"):
+            fit_parameters(light, view, radiance[:1], np.full_like(variance, np.inf))
+
+
+def test_a_given_start_leads_into_its_own_valley(simulate: Simulate) -> None:
+    model = get_model(SURFACE)
+    observations = simulate([0.3, 0.5, 0.7, 0.3, 0.05, 40.0], noise=0.002, step=3)
+    best = SOLVERS["separable"](make_problem(observations, model, {}, {}))
+    near = model.as_mapping(model.to_published(best.internal) * 1.05)
+    again = SOLVERS["separable"](make_problem(observations, model, {}, near))
+    np.testing.assert_allclose(again.internal, best.internal, rtol=1e-7)
+    assert again.evaluations < 10
+    # only a width far off is given: the other coordinates are its best ones, then all descend
+    wide = make_problem(observations, model, {}, {"inverse_sigma_s": 0.8})
+    assert wide.cost(SOLVERS["separable"](wide).internal) >= wide.cost(best.internal) * (1 - 1e-12)
