@@ -32,7 +32,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erf
 
 from ..geometry import FloatArray, IntArray
 from .torrance_sparrow import half_vector
@@ -179,4 +178,6 @@ def _beckmann_masking(tangent: FloatArray, alpha: float) -> tuple[FloatArray, Fl
     product = alpha * tangent
     a = 1 / np.maximum(product, _LOWEST_PRODUCT)
     tail = product * np.exp(-a * a) * (1 / math.sqrt(math.pi))
+    from scipy.special import erf  # takes longer to load than all models together
+
     return 1 + erf(a) + tail, tail

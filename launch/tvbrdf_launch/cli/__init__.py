@@ -7,9 +7,23 @@ import os
 import sys
 from collections.abc import Sequence
 
-from . import arm, demo, doctor, launch, mark, node, preview, report, samples, scan, stop, topic
+from . import (
+    arm,
+    demo,
+    doctor,
+    launch,
+    mark,
+    model,
+    node,
+    preview,
+    report,
+    samples,
+    scan,
+    stop,
+    topic,
+)
 
-VERBS = (demo, launch, stop, topic, node, arm, scan, preview, mark, report, samples, doctor)
+VERBS = (demo, launch, stop, topic, node, arm, scan, preview, mark, report, samples, model, doctor)
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 
@@ -31,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; return the exit status: 0, 1 (an error, told in one line), 2 (usage)."""
     root = parser()
     arguments, rest = root.parse_known_args(argv)
-    if rest and arguments.verb in ("launch", "demo") and all(":=" in word for word in rest):
+    if rest and hasattr(arguments, "arguments") and all(":=" in word for word in rest):
         arguments.arguments += rest  # key:=value words may stand after options
     elif rest:
         root.error(f"unrecognized arguments: {' '.join(rest)}")
