@@ -23,8 +23,6 @@ from .result import FitResult
 from .solvers import SOLVERS
 from .uncertainty import estimate, published_scale, to_published
 
-ScanFit = FitResult
-
 
 def fit_scan(
     observations: Observations,
@@ -214,7 +212,6 @@ __all__ = [
     "CommonErrors",
     "FitError",
     "FitResult",
-    "ScanFit",
     "Solution",
     "Solver",
     "fit_scan",

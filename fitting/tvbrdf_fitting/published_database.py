@@ -25,7 +25,7 @@ from .published_scan import PublishedScan, read_scan
 
 CATALOGUE_FILE: Final = "catalogue.sqlite"
 OBSERVATIONS_FOLDER: Final = "observations"
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 """Version of the catalogue's tables that this reader and the writer know."""
 
 
@@ -55,6 +55,9 @@ class StoredFit:
         Why the solver stopped.
     at_bound, undetermined
         Names of parameters that ended at a bound, or that the data do not determine.
+    details
+        Metric and loss of the fit, errors that frames share as it found them, and, where the model
+        was chosen, why this one.
     """
 
     model: str
@@ -69,6 +72,7 @@ class StoredFit:
     solve_time_ms: float
     at_bound: tuple[str, ...]
     undetermined: tuple[str, ...]
+    details: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +293,7 @@ def _read_fits(connection: sqlite3.Connection, sample_id: int) -> dict[int, Stor
             solve_time_ms=row["solve_time_ms"],
             at_bound=tuple(json.loads(row["at_bound"])),
             undetermined=tuple(json.loads(row["undetermined"])),
+            details=json.loads(row["details"]),
         )
     return fits
 

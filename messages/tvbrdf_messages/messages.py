@@ -195,12 +195,15 @@ class Parameters(Message):
     chi_square: float
     degrees_of_freedom: int
     model_error_std: float
-    """Of radiance, added to the noise because the model can't explain the data without."""
+    """Added to the noise because the model can't explain the data without; in the metric's unit."""
     reason: str
     """Why the solver stopped."""
     solver: str
     evaluations: int
     solve_time_ms: float
+    details: dict[str, Any]
+    """``metric``, ``loss``, ``down_weighted``; ``nuisances`` (errors that frames share, as found:
+    value and deviation by name); ``choice`` (why this model, and every one that was tried)."""
     covariance: Doubles = array_field("float64", shape=(None, None))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import tvbrdf_fitting
-from tvbrdf_fitting import CommonErrors, FitError, Observations, fit_scan, get_model
+from tvbrdf_fitting import CommonErrors, FitError, FitResult, Observations, fit_scan, get_model
 from tvbrdf_fitting.fit import SOLVERS
 from tvbrdf_fitting.problem import make_problem
 from tvbrdf_fitting.solvers import solve_trust_region

@@ -73,6 +73,7 @@ def fit_record(scan: int, model: str = SURFACE, seed: int = 0) -> FitRecord:
         solve_time_ms=12.5,
         at_bound=("sigma_d",),
         undetermined=(),
+        details={"metric": "log", "choice": {"reason": "simplest", "rungs": [{"model": model}]}},
     )
 
 

@@ -101,6 +101,7 @@ def parameters(scan: int, *, model: str = SURFACE, sample: str = "paint") -> Par
         evaluations=10,
         model_error_std=0.001,
         solve_time_ms=12.0,
+        details={"metric": "radiance", "nuisances": {"gain_camera1_b": [0.001, 0.0005]}},
         covariance=np.diag((values / 100) ** 2),
     )
 

@@ -92,6 +92,8 @@ class Fit(Base):
     """(p, p) doubles, little endian, row by row."""
     at_bound: Mapped[list[str]]
     undetermined: Mapped[list[str]]
+    details: Mapped[dict[str, Any]]
+    """Metric, loss, common errors as found, and why this model."""
     digest: Mapped[str]
     parameters: Mapped[list[Parameter]] = relationship(
         cascade="all, delete-orphan", order_by="Parameter.position"

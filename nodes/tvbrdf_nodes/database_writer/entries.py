@@ -101,6 +101,7 @@ def fit_row(record: FitRecord, digest: str) -> Fit:
         covariance=np.asarray(record.covariance, dtype="<f8").tobytes(),
         at_bound=list(record.at_bound),
         undetermined=list(record.undetermined),
+        details=plain(record.details),
         digest=digest,
         parameters=[
             Parameter(

@@ -278,4 +278,5 @@ def fit_record(parameters: Parameters) -> FitRecord:
         solve_time_ms=parameters.solve_time_ms,
         at_bound=parameters.at_bound,
         undetermined=parameters.undetermined,
+        details=parameters.details,
     )

@@ -74,6 +74,7 @@ class FitRecord:
     solve_time_ms: float = 0.0
     at_bound: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

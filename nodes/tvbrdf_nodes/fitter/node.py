@@ -13,8 +13,12 @@ from ..core.device import DeviceError
 from ..core.node import Node, Outputs, Release, Send, TopicUse
 
 if TYPE_CHECKING:
+    from tvbrdf_fitting.nuisances import CommonErrors
     from tvbrdf_fitting.observations import Observations
     from tvbrdf_fitting.result import FitResult
+
+
+AUTO = "auto"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,12 +26,17 @@ class FitterParameters:
     """What is fitted, and how."""
 
     model: str = "oren_nayar+torrance_sparrow"
+    """Or ``auto``: the simplest that explains the data, and kept while the next scans allow."""
     method: str = "separable"
+    metric: str = "radiance"
+    loss: str = "least_squares"
     fixed: dict[str, Any] = field(default_factory=dict)
     """Published values that are known, by name (for dust: w, g, Kd and σd)."""
 
     def __post_init__(self) -> None:
-        """Refuse fixed values that are no numbers."""
+        """Refuse fixed values that are no numbers, or whose model is not known yet."""
+        if self.fixed and self.model == AUTO:
+            raise ValueError(f"fixed: not with model: {AUTO}, which chooses among several models")
         for name, value in self.fixed.items():
             if not isinstance(value, (int, float)) or isinstance(value, bool):
                 raise ValueError(f"fixed: {name} is {value!r}, expected a number")
@@ -50,19 +59,28 @@ class FitterNode(Node[FitterParameters]):
     def prepare(self) -> None:
         """Load the solver, and refuse an unknown model or fixed parameter before anything moves."""
         from tvbrdf_fitting import separable
-        from tvbrdf_fitting.fit import fit_scan  # noqa: F401 - takes most of a second
+        from tvbrdf_fitting.fit import LOSSES, METRICS, SOLVERS  # takes most of a second
         from tvbrdf_fitting.models import get_model
 
+        given = self.parameters
+        for name, known in (("method", SOLVERS), ("metric", METRICS), ("loss", LOSSES)):
+            if getattr(given, name) not in known:
+                raise DeviceError(
+                    f"{name}: {getattr(given, name)!r} is unknown; known: {', '.join(known)}"
+                )
         separable.compile_all()
+        self._kept: dict[str, str] = {}
+        if given.model == AUTO:
+            import tvbrdf_fitting.model_choice  # noqa: F401
+
+            return
         try:
-            names = get_model(self.parameters.model).parameter_names
+            names = get_model(given.model).parameter_names
         except ValueError as error:
             raise DeviceError(f"model: {error}") from error
-        unknown = sorted(set(self.parameters.fixed) - set(names))
+        unknown = sorted(set(given.fixed) - set(names))
         if unknown:
-            raise DeviceError(
-                f"fixed: {', '.join(unknown)}: {self.parameters.model} has {', '.join(names)}"
-            )
+            raise DeviceError(f"fixed: {', '.join(unknown)}: {given.model} has {', '.join(names)}")
 
     def handle(self, envelope: Envelope) -> Outputs:
         """Fit a scan; forget one that is stored."""
@@ -73,28 +91,52 @@ class FitterNode(Node[FitterParameters]):
             yield Release("/scan/parameters", str(message.scan))
 
     def _fit(self, radiance: Radiance) -> Parameters:
-        from tvbrdf_fitting.fit import fit_scan
         from tvbrdf_fitting.nuisances import CommonErrors
         from tvbrdf_fitting.problem import FitError
 
-        offsets = dict(enumerate(radiance.light_angle_std_deg.tolist()))
         common = CommonErrors(
-            light_angle_std_deg=offsets,
+            light_angle_std_deg=dict(enumerate(radiance.light_angle_std_deg.tolist())),
             gain_relative_std=radiance.gain_relative_std,
             frame_relative_std=dict(enumerate(radiance.frame_relative_std, start=1)),
         )
         try:
-            result = fit_scan(
-                observations(radiance),
-                self.parameters.model,
-                method=self.parameters.method,
-                fixed=self.parameters.fixed,
-                common_errors=common,
-            )
+            if self.parameters.model == AUTO:
+                return self._chosen(radiance, common)
+            return _parameters(radiance, self._fitted(radiance, common), {})
         except (FitError, ValueError) as error:
             self.context.log.error(f"scan {radiance.scan} can't be fitted: {error}")
             return _unfitted(radiance, self.parameters.model, str(error))
-        return _parameters(radiance, result)
+
+    def _fitted(self, radiance: Radiance, common: CommonErrors) -> FitResult:
+        from tvbrdf_fitting.fit import fit_scan
+
+        given = self.parameters
+        return fit_scan(
+            observations(radiance),
+            given.model,
+            method=given.method,
+            metric=given.metric,
+            loss=given.loss,
+            fixed=given.fixed,
+            common_errors=common,
+        )
+
+    def _chosen(self, radiance: Radiance, common: CommonErrors) -> Parameters:
+        """Choose a model; the one of the sample's scan before stays unless evidence is clear."""
+        from tvbrdf_fitting.model_choice import choose_model
+
+        given = self.parameters
+        choice = choose_model(
+            observations(radiance),
+            method=given.method,
+            metric=given.metric,
+            loss=given.loss,
+            common_errors=common,
+            previous=self._kept.get(radiance.sample),
+        )
+        self._kept[radiance.sample] = choice.model
+        why = {"reason": choice.reason, "rungs": [rung.as_dict() for rung in choice.rungs]}
+        return _parameters(radiance, choice.result, {"choice": why})
 
 
 def observations(radiance: Radiance) -> Observations:
@@ -114,7 +156,7 @@ def observations(radiance: Radiance) -> Observations:
     )
 
 
-def _parameters(radiance: Radiance, result: FitResult) -> Parameters:
+def _parameters(radiance: Radiance, result: FitResult, more: dict[str, Any]) -> Parameters:
     return Parameters(
         sample=radiance.sample,
         scan=radiance.scan,
@@ -133,6 +175,13 @@ def _parameters(radiance: Radiance, result: FitResult) -> Parameters:
         solver=result.solver,
         evaluations=result.evaluations,
         solve_time_ms=1e3 * result.solve_time_s,
+        details={
+            "metric": result.metric,
+            "loss": result.loss,
+            "down_weighted": result.down_weighted,
+            "nuisances": {name: list(pair) for name, pair in result.nuisances.items()},
+            **more,
+        },
         covariance=result.covariance,
     )
 
@@ -141,9 +190,9 @@ def _unfitted(radiance: Radiance, model: str, reason: str) -> Parameters:
     """Say that a scan could not be fitted: every parameter undetermined, and why."""
     import numpy as np
 
-    from tvbrdf_fitting.models import get_model
+    from tvbrdf_fitting.models import SURFACE, get_model
 
-    chosen = get_model(model)
+    chosen = get_model(SURFACE if model == AUTO else model)
     count = len(chosen.parameter_names)
     nothing = (math.nan,) * count
     return Parameters(
@@ -164,5 +213,6 @@ def _unfitted(radiance: Radiance, model: str, reason: str) -> Parameters:
         solver="none",
         evaluations=0,
         solve_time_ms=0.0,
+        details={},
         covariance=np.full((count, count), math.nan),
     )
