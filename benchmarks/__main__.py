@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import platform
 
-from benchmarks import bus, rig, startup
+from benchmarks import bus, fit_optimum, fit_speed, fit_speed_error, fit_starts, rig, startup
 
 
 def main() -> None:
     """Print every figure."""
     print(f"{platform.platform()}, Python {platform.python_version()}, {os.cpu_count()} cores\n")
-    for benchmark in (bus, rig, startup):
+    fits = (fit_speed, fit_starts, fit_optimum, fit_speed_error)
+    for benchmark in (bus, rig, startup, *fits):
         benchmark.main()
         print()
 

@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .batch import ParameterBatch, fit_parameters
+    from .design import find_designs
     from .error_measures import ErrorMeasures, measure_errors, pool
     from .fit import fit_scan
     from .many_scans import fit_scans
+    from .model_choice import ModelChoice, choose_for_series, choose_model
     from .models import get_model
     from .nuisances import CommonErrors
     from .observations import Observations
+    from .prediction import predict, predict_over_models
     from .problem import FitError
+    from .published import read_sample, read_scan
     from .result import FitResult
 
 _MODULES = {
@@ -24,14 +28,22 @@ _MODULES = {
     "ErrorMeasures": "error_measures",
     "FitError": "problem",
     "FitResult": "result",
+    "ModelChoice": "model_choice",
     "Observations": "observations",
     "ParameterBatch": "batch",
+    "choose_for_series": "model_choice",
+    "choose_model": "model_choice",
+    "find_designs": "design",
     "fit_parameters": "batch",
     "fit_scan": "fit",
     "fit_scans": "many_scans",
     "get_model": "models",
     "measure_errors": "error_measures",
     "pool": "error_measures",
+    "predict": "prediction",
+    "predict_over_models": "prediction",
+    "read_sample": "published",
+    "read_scan": "published",
 }
 
 __all__ = [
@@ -39,14 +51,22 @@ __all__ = [
     "ErrorMeasures",
     "FitError",
     "FitResult",
+    "ModelChoice",
     "Observations",
     "ParameterBatch",
+    "choose_for_series",
+    "choose_model",
+    "find_designs",
     "fit_parameters",
     "fit_scan",
     "fit_scans",
     "get_model",
     "measure_errors",
     "pool",
+    "predict",
+    "predict_over_models",
+    "read_sample",
+    "read_scan",
 ]
 
 

@@ -20,6 +20,7 @@ from .published_info import (
 from .published_sample import (
     DUST_PARAMETERS,
     SURFACE_PARAMETERS,
+    PublishedRow,
     PublishedSample,
     format_parameters,
     list_samples,
@@ -50,6 +51,7 @@ __all__ = [
     "SURFACE_PARAMETERS",
     "CameraScan",
     "PublishedFormatError",
+    "PublishedRow",
     "PublishedSample",
     "PublishedScan",
     "SampleInfo",

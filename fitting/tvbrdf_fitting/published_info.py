@@ -25,6 +25,7 @@ from typing import Final
 import numpy as np
 
 from .published_text import (
+    COPY_AGAIN,
     PublishedFormatError,
     format_exposures,
     parse_exposures,
@@ -79,14 +80,18 @@ def read_info(path: Path | str) -> SampleInfo:
     lines = read_lines(path)
     if len(lines) < 3:
         raise PublishedFormatError(
-            path, len(lines), "the file is truncated: 'Sample', 'Exposure', 'Scans' are needed"
+            path,
+            len(lines),
+            f"the file is truncated: 'Sample', 'Exposure', 'Scans' are needed; {COPY_AGAIN}",
         )
     sample = _match(_SAMPLE, lines[0], path, 1, "Sample NAME (PROCESS)")
     exposures_ms = parse_exposures(lines[1], path, 2)
     count = int(_match(_SCANS, lines[2], path, 3, "Scans N")[1])
     if len(lines) < 3 + count:
         raise PublishedFormatError(
-            path, len(lines), f"the file is truncated: {len(lines) - 3} of {count} scans"
+            path,
+            len(lines),
+            f"the file is truncated: {len(lines) - 3} of {count} scans; {COPY_AGAIN}",
         )
     scans = []
     for line, text in enumerate(lines[3 : 3 + count], start=4):

@@ -17,7 +17,7 @@ Below the sample's folder ``sampleNN``, beside ``tvBrdf-data/`` (see :mod:`.publ
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -25,8 +25,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .models.torrance_sparrow import SIGMA_S_BOUNDS
 from .published_info import INFO_FILE, SampleInfo, read_info
-from .published_scan import PublishedScan, list_scans, read_scan
+from .published_scan import PublishedScan, list_scans, read_scan, scan_file_name
 from .published_text import (
     PublishedFormatError,
     format_numbers,
@@ -36,11 +37,14 @@ from .published_text import (
 )
 
 FITS_FILE: Final = "tvBrdf-fits/brdf-params.txt"
+LOST_FILE: Final = "tvBrdf-fits/brdf-params-lost.txt"
+"""Our addition: what of a fit ``brdf-params.txt`` has no room for, a line a scan."""
 CALIBRATION_FILE: Final = "tvBrdf-calibration.txt"
 
 SURFACE_PARAMETERS: Final = ("kd_b", "kd_g", "kd_r", "sigma_d", "ks", "inverse_sigma_s")
 DUST_PARAMETERS: Final = (*SURFACE_PARAMETERS, "w_b", "w_g", "w_r", "g", "tau")
 """Columns of ``brdf-params.txt``, without and with dust."""
+_COLOURED: Final = ("ks_b", "ks_g", "ks_r")
 PARAMETER_COUNTS: Final = (len(SURFACE_PARAMETERS), len(DUST_PARAMETERS))
 _G_COLUMN: Final = 9
 
@@ -86,8 +90,9 @@ def read_sample(
     *,
     calibration: Path | str | None = None,
     g_positive_is_forward: bool = True,
+    scans: Collection[int] | None = None,
 ) -> PublishedSample:
-    """Read a sample: all its scans and whatever else its folder holds.
+    """Read a sample: its scans and whatever else its folder holds.
 
     Parameters
     ----------
@@ -97,23 +102,28 @@ def read_sample(
         File with the constants; by default ``tvBrdf-calibration.txt`` in the folder, if any.
     g_positive_is_forward
         See :func:`read_parameters`.
+    scans
+        Numbers of the scans to read, by default all; the others' files are only counted.
 
     Raises
     ------
     PublishedFormatError
-        If a file breaks the layout, or files disagree about which scans there are.
+        If a file breaks the layout, a scan that is asked for has none, or files disagree about
+        which scans there are.
     """
     folder = Path(folder)
     numbers = list_scans(folder)
     if not numbers:
-        raise PublishedFormatError(folder, None, "holds no scan file in tvBrdf-data/")
+        raise PublishedFormatError(
+            folder, None, f"holds no scan file in tvBrdf-data/, such as {scan_file_name(1, 1)}"
+        )
     info = read_info(folder / INFO_FILE) if (folder / INFO_FILE).exists() else None
     if info is not None and tuple(scan.scan for scan in info.scans) != numbers:
         raise PublishedFormatError(
             folder / INFO_FILE,
             None,
             f"lists scans {[scan.scan for scan in info.scans]}, but tvBrdf-data/ has files of "
-            f"{list(numbers)}",
+            f"{list(numbers)}; correct the list, or bring the missing files",
         )
     parameters = None
     fitted: tuple[int, ...] = ()
@@ -127,13 +137,15 @@ def read_sample(
     rows = 0 if parameters is None else len(parameters)
     if rows != len(fitted):
         raise PublishedFormatError(
-            folder / FITS_FILE, None, f"has {rows} lines for {len(fitted)} fitted scans"
+            folder / FITS_FILE,
+            None,
+            f"has {rows} lines for {len(fitted)} fitted scans; correct the file or remove it",
         )
     if calibration is None and (folder / CALIBRATION_FILE).exists():
         calibration = folder / CALIBRATION_FILE
     return PublishedSample(
         folder=folder,
-        scans=tuple(read_scan(folder, scan) for scan in numbers),
+        scans=tuple(read_scan(folder, scan) for scan in (numbers if scans is None else scans)),
         calibration=np.ones((4, 3)) if calibration is None else read_calibration(calibration),
         parameters=parameters,
         parameter_scans=fitted,
@@ -193,8 +205,27 @@ def write_parameters(path: Path | str, parameters: ArrayLike) -> None:
     write_atomically(Path(path), format_parameters(parameters, path))
 
 
-def parameters_row(names: Sequence[str], values: ArrayLike) -> NDArray[np.float64] | None:
+@dataclass(frozen=True, eq=False)
+class PublishedRow:
+    """One scan's parameters as ``brdf-params.txt`` has room for.
+
+    Attributes
+    ----------
+    values
+        (6,) or (11,).
+    lost
+        What the layout has no room for, in words; empty where nothing is lost.
+    """
+
+    values: NDArray[np.float64]
+    lost: str = ""
+
+
+def parameters_row(names: Sequence[str], values: ArrayLike) -> PublishedRow | None:
     """Fitted parameters in the order of ``brdf-params.txt``.
+
+    Amplitudes of the lobe that differ by channel become their mean, and the row says so. What a
+    simpler model leaves out is 0: sigma_d (Lambert), Ks (no lobe; sigma_s is then the largest).
 
     Parameters
     ----------
@@ -205,15 +236,27 @@ def parameters_row(names: Sequence[str], values: ArrayLike) -> NDArray[np.float6
 
     Returns
     -------
-    ndarray or None
-        (6,) or (11,); None where the layout has no place for them: parameters of another model,
-        or a number that is not finite.
+    PublishedRow or None
+        None where the layout has no place for them: parameters of another model, or a number that
+        is not finite.
     """
     by_name = dict(zip(names, np.asarray(values, dtype=np.float64).tolist(), strict=True))
+    lost = ""
+    if by_name.keys() >= set(_COLOURED):
+        each = [by_name.pop(name) for name in _COLOURED]
+        by_name["ks"] = float(np.mean(each))
+        lost = (
+            f"Ks of the channels, {format_numbers(each)} (B, G, R), is written as its mean "
+            f"{format_numbers([by_name['ks']])}"
+        )
+    if by_name.keys() >= set(SURFACE_PARAMETERS[:3]):
+        by_name.setdefault("sigma_d", 0.0)
+        if not by_name.keys() & {"ks", "inverse_sigma_s"}:
+            by_name |= {"ks": 0.0, "inverse_sigma_s": 1 / SIGMA_S_BOUNDS[1]}
     for columns in (SURFACE_PARAMETERS, DUST_PARAMETERS):
         if by_name.keys() == set(columns):
             row = np.array([by_name[name] for name in columns])
-            return row if np.isfinite(row).all() else None
+            return PublishedRow(row, lost) if np.isfinite(row).all() else None
     return None
 
 
@@ -228,14 +271,18 @@ def read_calibration(path: Path | str) -> NDArray[np.float64]:
     path = Path(path)
     rows = _read_table(path)
     if len(rows) != 4:
-        raise PublishedFormatError(path, None, f"has {len(rows)} lines instead of 4, one a camera")
+        raise PublishedFormatError(
+            path, None, f"has {len(rows)} lines instead of 4, one a camera (B, G, R each)"
+        )
     for index, row in enumerate(rows):
         if len(row) != 3:
             raise PublishedFormatError(
                 path, index + 1, f"has {len(row)} numbers instead of 3 (B, G, R)"
             )
         if min(row) <= 0:
-            raise PublishedFormatError(path, index + 1, f"{min(row):g} is not positive")
+            raise PublishedFormatError(
+                path, index + 1, f"{min(row):g} is not positive: radiances are divided by it"
+            )
     return np.array(rows, dtype=np.float64)
 
 

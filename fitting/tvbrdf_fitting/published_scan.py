@@ -9,7 +9,8 @@
 
 Every number has 6 decimals. A light position that was hidden by the arm, or where any channel is
 invalid, has no group: nothing stands for "not measured". A file that was cut exactly between two
-groups therefore reads as one with fewer light positions.
+groups therefore reads as one with fewer light positions; the other cameras' files show it (see
+:mod:`.published_checks`, also for the order of the colours, which no line states).
 """
 
 from __future__ import annotations
@@ -17,28 +18,37 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .published_text import (
+    COPY_AGAIN,
     PublishedFormatError,
     format_exposures,
     parse_exposures,
     parse_number,
     read_bytes,
+    shown,
     write_atomically,
 )
 
+if TYPE_CHECKING:
+    from .observations import Observations
+
 UNIT_TOLERANCE: Final = 1e-4
 """Largest accepted difference of a direction's length from 1 (rounding to 6 decimals: 9e-7)."""
+
+LARGEST_RADIANCE: Final = 1e12
+"""Anything above is a damaged number: squares of sums of squares must stay finite."""
 
 DATA_FOLDER: Final = "tvBrdf-data"
 CAMERAS: Final = (1, 2, 3, 4)
 
 _NAME = re.compile(r"scan(\d{2,})_brdf_camera(\d)_allexposures\.txt")
 _KEYS: Final = ("F", "L", "V")
+_MEANING: Final = {"F": "radiance b g r", "L": "light x y z", "V": "view x y z"}
 _FRACTION: Final = np.array([100_000, 10_000, 1_000, 100, 10, 1], dtype=np.int64)
 _POWERS: Final = 10 ** np.arange(9, dtype=np.int64)
 
@@ -73,6 +83,19 @@ class PublishedScan:
     exposures_ms: tuple[float, ...]
     cameras: dict[int, CameraScan]
 
+    def observations(self, calibration: ArrayLike | None = None) -> Observations:
+        """Return what `fit_scan` takes, with a noise that is estimated from the scan itself.
+
+        Parameters
+        ----------
+        calibration
+            (4, 3) constants of cameras 1-4, B, G, R, that the radiances are divided by, as
+            `read_calibration` gives them; by default 1. See :mod:`.published_observations`.
+        """
+        from .published_observations import scan_observations
+
+        return scan_observations(self, calibration)
+
 
 def scan_file_name(scan: int, camera: int) -> str:
     """Name of a scan file, e.g. ``scan01_brdf_camera1_allexposures.txt``."""
@@ -106,10 +129,14 @@ def read_scan_file(path: Path | str) -> CameraScan:
     data = read_bytes(path)
     end = data.find(b"\n")
     if end < 0:
-        raise PublishedFormatError(path, 1, "the file is truncated: its first line has no end")
+        raise PublishedFormatError(
+            path, 1, f"the file is truncated: its first line has no end; {COPY_AGAIN}"
+        )
     exposures_ms = parse_exposures(data[:end].decode("utf-8", "replace"), path, 1)
     if end + 1 == len(data):
-        raise PublishedFormatError(path, 1, "the file is truncated: no 'F' line follows")
+        raise PublishedFormatError(
+            path, 1, f"the file is truncated: no 'F' line follows; {COPY_AGAIN}"
+        )
     body = data[end + 1 :]
     groups = _parse_canonical(body)
     if groups is None:  # not as we write it: find out where and why, or accept it
@@ -172,7 +199,9 @@ def _parse_lines(body: bytes, path: Path) -> NDArray[np.float64]:
     lines = body.decode("utf-8", "replace").split("\n")
     if lines[-1]:
         raise PublishedFormatError(
-            path, len(lines) + 1, "the file is truncated: its last line has no end"
+            path,
+            len(lines) + 1,
+            f"the file is truncated: its last line has no end; {COPY_AGAIN}",
         )
     lines.pop()
     numbers: list[list[float]] = []
@@ -183,18 +212,23 @@ def _parse_lines(body: bytes, path: Path) -> NDArray[np.float64]:
         if not tokens or tokens[0] != key:
             found = tokens[0] if tokens else ""
             raise PublishedFormatError(
-                path, line, f"starts with {found!r} where a line '{key} a b c' belongs"
+                path,
+                line,
+                f"starts with {shown(found)} where a line '{key} a b c' belongs: each light "
+                f"position has an F, an L and a V line; {COPY_AGAIN}",
             )
         if len(tokens) != 4:
             raise PublishedFormatError(
-                path, line, f"has {len(tokens) - 1} numbers after {key!r} instead of 3"
+                path,
+                line,
+                f"has {len(tokens) - 1} numbers after {key!r} instead of 3 ({_MEANING[key]})",
             )
         numbers.append([parse_number(token, path, line) for token in tokens[1:]])
     if len(numbers) % 3:
         raise PublishedFormatError(
             path,
             len(numbers) + 1,
-            f"the file is truncated: no {_KEYS[len(numbers) % 3]!r} line follows",
+            f"the file is truncated: no {_KEYS[len(numbers) % 3]!r} line follows; {COPY_AGAIN}",
         )
     return np.array(numbers, dtype=np.float64).reshape(-1, 3, 3)
 
@@ -202,15 +236,38 @@ def _parse_lines(body: bytes, path: Path) -> NDArray[np.float64]:
 def _checked(
     exposures_ms: tuple[float, ...], groups: NDArray[np.float64], path: Path
 ) -> CameraScan:
-    lengths = np.sqrt(np.einsum("mkc,mkc->mk", groups[:, 1:], groups[:, 1:]))
-    _refuse(np.abs(lengths - 1) > UNIT_TOLERANCE, path, "the {name} direction is no unit vector")
-    _refuse(groups[:, 1:, 2] <= 0, path, "the {name} direction is below the sample's horizon")
+    absurd = np.abs(groups[:, 0]) > LARGEST_RADIANCE
+    if absurd.any():
+        group, channel = (int(index) for index in np.argwhere(absurd)[0])
+        raise PublishedFormatError(
+            path,
+            2 + 3 * group,
+            f"radiance {groups[group, 0, channel]:g} is beyond any that a camera measures",
+        )
+    directions = groups[:, 1:]
+    lengths = np.sqrt(np.einsum("mkc,mkc->mk", directions, directions))
+    _refuse(
+        np.abs(lengths - 1) > UNIT_TOLERANCE,
+        directions,
+        path,
+        "is no unit vector",
+        "give x y z of length 1, in the sample's frame",
+    )
+    _refuse(
+        directions[..., 2] <= 0,
+        directions,
+        path,
+        "is below the sample's horizon",
+        "leave out such positions, or turn the directions into the sample's frame (z its normal)",
+    )
     view = groups[0, 2]
     changed = (groups[:, 2] != view).any(axis=1)
     _refuse(
         np.stack([np.zeros_like(changed), changed], axis=1),
+        directions,
         path,
-        "the {name} direction changes within the file",
+        "changes within the file",
+        f"it began as {_vector(view)}; a file belongs to one camera",
     )
     return CameraScan(
         exposures_ms=exposures_ms,
@@ -220,12 +277,29 @@ def _checked(
     )
 
 
-def _refuse(faults: NDArray[np.bool_], path: Path, problem: str) -> None:
-    """Raise for the first true entry of (m, 2) faults of the lines L and V."""
-    if faults.any():
-        group, which = np.argwhere(faults)[0]
-        name = ("light", "view")[which]
-        raise PublishedFormatError(path, 3 + 3 * int(group) + int(which), problem.format(name=name))
+def _refuse(
+    faults: NDArray[np.bool_],
+    directions: NDArray[np.float64],
+    path: Path,
+    problem: str,
+    remedy: str,
+) -> None:
+    """Raise for the first true entry of (m, 2) faults of the directions (m, 2, 3), L and V."""
+    if not faults.any():
+        return
+    group, which = (int(index) for index in np.argwhere(faults)[0])
+    vector, count = directions[group, which], int(faults[:, which].sum())
+    found = f"{_vector(vector)}, length {float(np.linalg.norm(vector)):.6g}"
+    also = f"; {count} such lines" if count > 1 else ""
+    raise PublishedFormatError(
+        path,
+        3 + 3 * group + which,
+        f"the {('light', 'view')[which]} direction {problem} ({found}{also}): {remedy}",
+    )
+
+
+def _vector(vector: NDArray[np.float64]) -> str:
+    return " ".join(f"{component:g}" for component in vector)
 
 
 def format_scan_file(camera_scan: CameraScan, path: Path | str = "scan file") -> bytes:
@@ -271,29 +345,49 @@ def write_scan_file(path: Path | str, camera_scan: CameraScan) -> None:
     write_atomically(Path(path), format_scan_file(camera_scan, path))
 
 
-def read_scan(folder: Path | str, scan: int) -> PublishedScan:
+def read_scan(path: Path | str, scan: int | None = None) -> PublishedScan:
     """Read all cameras' files of one scan.
 
     Parameters
     ----------
-    folder
-        The sample's folder, which holds ``tvBrdf-data``.
+    path
+        The sample's folder, which holds ``tvBrdf-data``; or one of the scan's files, which lies
+        beside the other cameras'.
     scan
-        Its number, from 1. A camera without a file is left out.
+        Its number, from 1; may be left out for a file, and where there is one scan only. A camera
+        without a file is left out.
 
     Raises
     ------
     PublishedFormatError
-        If no camera has a file, or the files' exposures differ.
+        If no camera has a file, the files' exposures differ, or it is not said which scan.
     """
-    data_folder = Path(folder) / DATA_FOLDER
+    path = Path(path)
+    named = None if path.is_dir() else parse_scan_file_name(path.name)
+    if named is not None:
+        if scan not in {None, named[0]}:
+            raise PublishedFormatError(path, None, f"is a file of scan {named[0]}, not of {scan}")
+        if not path.is_file():
+            raise PublishedFormatError(path, None, "there is no such file")
+        return _read_cameras(path.parent, named[0])
+    if scan is None:
+        numbers = list_scans(path)
+        if len(numbers) != 1:
+            raise PublishedFormatError(path, None, f"has {len(numbers)} scans: say which to read")
+        scan = numbers[0]
+    return _read_cameras(path / DATA_FOLDER, scan)
+
+
+def _read_cameras(data_folder: Path, scan: int) -> PublishedScan:
     cameras = {}
     for camera in CAMERAS:
         path = data_folder / scan_file_name(scan, camera)
-        if path.exists():
+        if path.exists() or path.is_symlink():  # a link to nothing is no camera without a file
             cameras[camera] = read_scan_file(path)
     if not cameras:
-        raise PublishedFormatError(data_folder, None, f"has no file of scan {scan:02d}")
+        raise PublishedFormatError(
+            data_folder, None, f"has no file of scan {scan:02d}, {scan_file_name(scan, 1)}"
+        )
     exposures_ms = next(iter(cameras.values())).exposures_ms
     for camera, camera_scan in cameras.items():
         if camera_scan.exposures_ms != exposures_ms:
@@ -301,7 +395,7 @@ def read_scan(folder: Path | str, scan: int) -> PublishedScan:
                 data_folder / scan_file_name(scan, camera),
                 1,
                 f"exposures {camera_scan.exposures_ms} differ from the other cameras' "
-                f"{exposures_ms} ms",
+                f"{exposures_ms} ms; is it a file of another scan?",
             )
     return PublishedScan(scan, exposures_ms, cameras)
 

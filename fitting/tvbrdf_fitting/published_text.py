@@ -17,6 +17,10 @@ DECIMALS = 6
 TEMPORARY_PREFIX = ".writing-"
 """Beginning of the name of a file that is not whole yet."""
 
+COPY_AGAIN = "copy it again from where it came"
+"""What to do about a damaged file."""
+_LONGEST_SHOWN = 40
+
 
 class PublishedFormatError(ValueError):
     """A file, or what is to be written as one, breaks the published layout."""
@@ -26,6 +30,11 @@ class PublishedFormatError(ValueError):
         self.line = line
         self.problem = problem
         super().__init__(f"{path}: {problem}" if line is None else f"{path}:{line}: {problem}")
+
+
+def shown(text: str) -> str:
+    """Return a piece of a file as an error quotes it: damaged ones have no line ends for long."""
+    return repr(text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…")
 
 
 def format_numbers(values: Iterable[float]) -> str:
@@ -44,9 +53,14 @@ def parse_number(token: str, path: Path | str, line: int) -> float:
     try:
         value = float(token)
     except ValueError:
-        raise PublishedFormatError(path, line, f"{token!r} is not a number") from None
+        hint = "; decimals follow a point" if "," in token else ""
+        raise PublishedFormatError(path, line, f"{shown(token)} is not a number{hint}") from None
     if not math.isfinite(value):
-        raise PublishedFormatError(path, line, f"{token!r} is not a finite number")
+        raise PublishedFormatError(
+            path,
+            line,
+            f"{shown(token)} is not a finite number; leave out what was not measured",
+        )
     return value
 
 
@@ -62,7 +76,10 @@ def parse_exposures(text: str, path: Path | str, line: int) -> tuple[float, ...]
     if not tokens or tokens[0] != "Exposure":
         found = tokens[0] if tokens else ""
         raise PublishedFormatError(
-            path, line, f"starts with {found!r}; the line 'Exposure a b c' is missing"
+            path,
+            line,
+            f"starts with {shown(found)}; the line 'Exposure a b c' is missing: "
+            "is it a file of the published layout?",
         )
     exposures_ms = tuple(parse_number(token, path, line) for token in tokens[1:])
     if not exposures_ms:
@@ -103,7 +120,7 @@ def read_bytes(path: Path) -> bytes:
     except OSError as error:
         raise PublishedFormatError(path, None, f"cannot be read: {error.strerror}") from error
     if not data:
-        raise PublishedFormatError(path, None, "is empty")
+        raise PublishedFormatError(path, None, f"is empty; {COPY_AGAIN}")
     return data
 
 
@@ -118,7 +135,9 @@ def read_lines(path: Path) -> list[str]:
     lines = text.split("\n")
     if lines[-1]:
         raise PublishedFormatError(
-            path, len(lines), "the file is truncated: its last line has no end"
+            path,
+            len(lines),
+            f"the file is truncated: its last line has no end; {COPY_AGAIN}",
         )
     return lines[:-1]
 

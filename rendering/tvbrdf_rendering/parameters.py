@@ -72,25 +72,22 @@ def series_of(sample: StoredSample, truth: Truth) -> list[Series]:
     fitted = [(scan, scan.fit) for scan in sample.scans if scan.fit is not None]
     if not fitted:
         raise DatabaseError(f"{sample.folder}: sample {sample.name!r} has no fitted scan to plot")
-    time_s = np.array([scan.time_s for scan, _ in fitted])
     all_series = []
-    for name in fitted[0][1].parameter_names:
-        places = [fit.parameter_names.index(name) for _, fit in fitted]
+    for name in dict.fromkeys(name for _, fit in fitted for name in fit.parameter_names):
+        # where models are chosen, not every scan has every parameter
+        having = [(scan, fit) for scan, fit in fitted if name in fit.parameter_names]
+        places = [fit.parameter_names.index(name) for _, fit in having]
         known = [(time, truth.of(scan, name)) for scan, time in sorted(_times(sample, truth))]
         true = np.array([pair for pair in known if pair[1] is not None], dtype=np.float64)
         true = true.reshape(-1, 2)
+        pairs = list(zip(having, places, strict=True))
         all_series.append(
             Series(
                 name,
-                time_s,
-                np.array([fit.values[at] for (_, fit), at in zip(fitted, places, strict=True)]),
-                np.array(
-                    [
-                        fit.standard_deviations[at]
-                        for (_, fit), at in zip(fitted, places, strict=True)
-                    ]
-                ),
-                np.array([name in fit.at_bound + fit.undetermined for _, fit in fitted]),
+                np.array([scan.time_s for scan, _ in having]),
+                np.array([fit.values[at] for (_, fit), at in pairs]),
+                np.array([fit.standard_deviations[at] for (_, fit), at in pairs]),
+                np.array([name in fit.at_bound + fit.undetermined for _, fit in having]),
                 true[:, 0],
                 true[:, 1],
             )

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from tests.fitting.conftest import Simulate
 
+from tests.fitting.conftest import Simulate
 from tvbrdf_fitting.fit import FitError, fit_scan
 from tvbrdf_fitting.geometry import (
     CAMERA_ANGLES_DEG,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from tests.fitting.precision import (
     Number,
     Terms,
@@ -18,7 +19,6 @@ from tests.fitting.precision import (
 )
 from tests.fitting.test_precision_oren_nayar import lambert, oren_nayar
 from tests.fitting.test_precision_torrance_sparrow import torrance_sparrow
-
 from tvbrdf_fitting.models import get_model
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from tests.fitting.precision import (
     EPS,
     LIMIT_EPS,
@@ -22,7 +23,6 @@ from tests.fitting.precision import (
     mpf,
     ordinary_directions,
 )
-
 from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.models import get_model
 from tvbrdf_fitting.models.oren_nayar import Basis

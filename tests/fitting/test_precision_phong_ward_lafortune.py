@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+
 from tests.fitting.precision import (
     Number,
     Terms,
@@ -20,7 +21,6 @@ from tests.fitting.precision import (
     mp,
     mpf,
 )
-
 from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.models import get_model
 from tvbrdf_fitting.models.phong import EXPONENT_BOUNDS

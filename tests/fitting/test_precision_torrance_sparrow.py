@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from tests.fitting.precision import (
     Number,
     Vector,
@@ -16,7 +17,6 @@ from tests.fitting.precision import (
     hard_directions,
     mp,
 )
-
 from tvbrdf_fitting.geometry import FloatArray
 
 

@@ -218,9 +218,32 @@ def test_parameters_of_our_models_are_put_in_the_published_order() -> None:
         values = {name: 1.0 + columns.index(name) for name in columns}
         shuffled = sorted(names)
         row = parameters_row(shuffled, [values[name] for name in shuffled])
-        np.testing.assert_array_equal(row, np.arange(1.0, len(columns) + 1))
+        assert row is not None
+        np.testing.assert_array_equal(row.values, np.arange(1.0, len(columns) + 1))
+        assert row.lost == ""
     assert parameters_row(SURFACE_PARAMETERS, [1, 2, 3, 4, 5, np.inf]) is None
-    assert parameters_row(("kd_b", "kd_g", "kd_r", "sigma_d"), [1, 2, 3, 4]) is None
+    assert parameters_row(("ks", "alpha", "eta"), [1, 2, 3]) is None
+    two_lobes = get_model("oren_nayar+torrance_sparrow+torrance_sparrow").parameter_names
+    assert parameters_row(two_lobes, np.ones(8)) is None
+
+
+def test_simpler_and_coloured_models_have_a_row_that_says_what_is_lost() -> None:
+    matte = parameters_row(get_model("lambert").parameter_names, [0.1, 0.2, 0.3])
+    assert matte is not None
+    np.testing.assert_allclose(matte.values, [0.1, 0.2, 0.3, 0.0, 0.0, 1 / 1.5])
+    assert matte.lost == ""
+    # what the row means is what was fitted
+    light, view = np.array([[0.0, 0.6, 0.8]]), np.array([[0.6, 0.0, 0.8]])
+    np.testing.assert_allclose(
+        get_model("ON+TS").evaluate(light, view, matte.values),
+        get_model("lambert").evaluate(light, view, [0.1, 0.2, 0.3]),
+    )
+    names = get_model("oren_nayar+torrance_sparrow(coloured)").parameter_names
+    metal = parameters_row(names, [0.1, 0.2, 0.3, 0.4, 1.0, 2.0, 6.0, 8.0])
+    assert metal is not None
+    np.testing.assert_allclose(metal.values, [0.1, 0.2, 0.3, 0.4, 3.0, 8.0])
+    assert "written as its mean 3" in metal.lost
+    assert "1.000000 2.000000 6.000000" in metal.lost
 
 
 def test_calibration(tmp_path: Path) -> None:

@@ -418,3 +418,17 @@ def test_observations_hold_no_pickle(tmp_path: Path) -> None:
     data = (tmp_path / "sample01" / "observations" / "scan01.npz").read_bytes()
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         assert set(arrays.files) == {"radiance", "valid", "camera"}
+
+
+def test_what_the_published_file_has_no_room_for_is_said_beside_it(tmp_path: Path) -> None:
+    with DatabaseStore(tmp_path, "blue_paint", process="drying", run_id="r1") as store:
+        for scan, model in ((1, "oren_nayar+torrance_sparrow(coloured)"), (2, SURFACE)):
+            store.store_scan(scan_record(scan))
+            store.store_parameters(fit_record(scan, model))
+    (lost,) = tmp_path.rglob("brdf-params-lost.txt")
+    (line,) = lost.read_text().splitlines()
+    assert line.startswith("scan 1: Ks of the channels, ")
+    rows = [row.split() for row in (lost.parent / "brdf-params.txt").read_text().splitlines()]
+    assert [len(row) for row in rows] == [6, 6]
+    (sample,) = read_database(tmp_path).samples
+    assert [len(scan.fit.values) for scan in sample.scans if scan.fit] == [8, 6]

@@ -9,8 +9,11 @@ from collections.abc import Sequence
 
 from . import (
     arm,
+    bench,
     demo,
+    design,
     doctor,
+    fit,
     launch,
     mark,
     model,
@@ -23,7 +26,24 @@ from . import (
     topic,
 )
 
-VERBS = (demo, launch, stop, topic, node, arm, scan, preview, mark, report, samples, model, doctor)
+VERBS = (
+    demo,
+    launch,
+    stop,
+    topic,
+    node,
+    arm,
+    scan,
+    preview,
+    mark,
+    report,
+    fit,
+    samples,
+    model,
+    design,
+    bench,
+    doctor,
+)
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 

@@ -68,8 +68,10 @@ def add_note(
     return True
 
 
-def check_model(session: Session, sample_id: int, model: str) -> None:
-    """Refuse a fit of another model than the sample's other fits: the text file holds one."""
+def check_model(session: Session, sample_id: int, model: str, *, chosen: bool) -> None:
+    """Refuse a fit of another model than the sample's other fits, unless models are chosen."""
+    if chosen:
+        return
     others = select(Fit.model).join(Scan, Scan.id == Fit.scan_id)
     known = session.scalar(others.where(Scan.sample_id == sample_id).limit(1))
     if known is not None and known != model:

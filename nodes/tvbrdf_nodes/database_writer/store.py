@@ -202,7 +202,8 @@ class DatabaseStore:
                 known = None if scan.fit is None else scan.fit.digest
                 stamp_ns = scan.start_stamp_ns or 0
                 if known is None:
-                    check_model(session, self._sample_id, record.model)
+                    chosen = "choice" in record.details
+                    check_model(session, self._sample_id, record.model, chosen=chosen)
                     scan.fit = fit_row(record, digest)
             if known is not None:
                 if known != digest:

@@ -12,6 +12,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from tvbrdf_fitting.published import (
+    PublishedRow,
     SampleInfo,
     ScanInfo,
     format_info,
@@ -20,7 +21,7 @@ from tvbrdf_fitting.published import (
 )
 from tvbrdf_fitting.published_database import OBSERVATIONS_FOLDER, DatabaseError
 from tvbrdf_fitting.published_info import INFO_FILE
-from tvbrdf_fitting.published_sample import FITS_FILE
+from tvbrdf_fitting.published_sample import FITS_FILE, LOST_FILE
 from tvbrdf_fitting.published_scan import DATA_FOLDER
 from tvbrdf_fitting.published_text import (
     TEMPORARY_PREFIX,
@@ -86,12 +87,17 @@ def write_derived(session: Session, sample_id: int, folder: Path) -> None:
     """Write ``brdf-params.txt`` and ``tvBrdf-info.txt`` from the catalogue where they changed.
 
     A fit that the layout has no place for (another model's parameters, a value that is not
-    finite) has no line, and its scan is ``unfitted`` there; the catalogue has it.
+    finite) has no line, and its scan is ``unfitted`` there; the catalogue has it. Where the layout
+    has place for a part only, ``brdf-params-lost.txt`` says what is missing.
     """
     sample = session.get_one(Sample, sample_id)
     rows = _fitted_rows(session, sample_id)
     if rows:
-        _write_if_changed(folder / FITS_FILE, format_parameters(list(rows.values())))
+        values = [row.values for row in rows.values()]
+        _write_if_changed(folder / FITS_FILE, format_parameters(values))
+        lost = [f"scan {number}: {row.lost}\n" for number, row in rows.items() if row.lost]
+        if lost or (folder / LOST_FILE).exists():
+            _write_if_changed(folder / LOST_FILE, "".join(lost).encode())
     scans = session.scalars(
         select(Scan).where(Scan.sample_id == sample_id).order_by(Scan.number)
     ).all()
@@ -111,9 +117,7 @@ def write_derived(session: Session, sample_id: int, folder: Path) -> None:
     _write_if_changed(folder / INFO_FILE, format_info(info))
 
 
-def _fitted_rows(
-    session: Session, sample_id: int
-) -> dict[int, np.ndarray[tuple[int], np.dtype[np.float64]]]:
+def _fitted_rows(session: Session, sample_id: int) -> dict[int, PublishedRow]:
     fits = session.execute(
         select(Scan.number, Fit)
         .join(Fit, Fit.scan_id == Scan.id)

@@ -349,6 +349,26 @@ def test_known_parameters_are_not_fitted(record: Run) -> None:
     assert errors["kd_b"] > 0.0
 
 
+def test_the_model_is_chosen_and_why_is_kept(record: Run) -> None:
+    found = fit(record, model="auto", metric="radiance")
+    live = record.parameters[0]
+    assert found.model == live.model == "oren_nayar+torrance_sparrow"
+    assert found.details["choice"]["reason"].startswith(found.model)
+    tried = [rung["model"] for rung in found.details["choice"]["rungs"]]
+    assert {"lambert", "oren_nayar", found.model} <= set(tried)
+    # one fit among several, from the same values
+    np.testing.assert_allclose(found.values, live.values, rtol=1e-6)
+
+
+def test_what_the_fit_assumed_travels_with_it(record: Run) -> None:
+    found = fit(record, loss="huber", metric="log")
+    assert (found.details["metric"], found.details["loss"]) == ("log", "huber")
+    gain, deviation = record.parameters[0].details["nuisances"]["gain_camera1_b"]
+    # the calibration's own statement of its gains limits both
+    assert abs(gain) < 5 * record.radiance[0].gain_relative_std
+    assert 0 < deviation < 1.01 * record.radiance[0].gain_relative_std
+
+
 def test_a_scan_that_can_not_be_fitted_is_told_and_does_not_end_the_node(record: Run) -> None:
     def spoil(envelope: Envelope, message: Any) -> Envelope:
         if isinstance(message, Radiance):
@@ -385,6 +405,8 @@ def test_parameters_are_kept_until_they_are_stored(record: Run) -> None:
     [
         ({"model": "velvet"}, "model: unknown model 'velvet'; known models: cook_torrance"),
         ({"fixed": {"colour": 1.0}}, "fixed: colour: .* has kd_b, kd_g"),
+        ({"metric": "beauty"}, "metric: 'beauty' is unknown; known: radiance"),
+        ({"method": "magic"}, "method: 'magic' is unknown; known: separable"),
     ],
 )
 def test_an_unknown_model_or_parameter_ends_the_fitter_before_anything_moves(

@@ -1,0 +1,100 @@
+"""The picture of speed against error: everything is drawn, within the page."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.text import Text
+
+from tvbrdf_rendering.speed_error import plot_speed_error, speed_error_figure
+
+
+@dataclass(frozen=True)
+class One:
+    solver: str
+    lights: int
+    cameras: int
+    noise: float | None
+    time_ms: float
+    brdf: float
+    brdf_95: float
+    fast: bool = False
+    precision: str = "float64"
+
+
+def combinations(*noises: float | None) -> list[One]:
+    speeds = {"separable": 0.1, "paper": 8.0, "scipy lm": 3.0, "somebody's": 1.0}
+    return [
+        One(
+            solver,
+            lights,
+            cameras,
+            noise,
+            time_ms=speed * (1 + lights / 300) * cameras**0.2,
+            brdf=(noise or 0.01) / math.sqrt(lights * cameras),
+            brdf_95=3 * (noise or 0.01) / math.sqrt(lights * cameras),
+            fast=solver == "separable" and cameras == 4,
+        )
+        for noise in noises
+        for solver, speed in speeds.items()
+        for lights in (12, 48, 361)
+        for cameras in (1, 4)
+    ]
+
+
+def drawn_points(figure: Figure) -> int:
+    """Points drawn as markers without a line, which the upper panels' are."""
+    lines = [line for axes in figure.axes for line in axes.get_lines()]
+    return sum(np.size(line.get_xdata()) for line in lines if line.get_linestyle() == "None")
+
+
+@pytest.mark.parametrize("noises", [(None,), (0.005,), (0.001, 0.02), (0.001, 0.005, 0.02)])
+def test_all_is_drawn_and_all_texts_are_on_the_page(noises: tuple[float | None, ...]) -> None:
+    cells = combinations(*noises)
+    figure = speed_error_figure(cells, title="sample07, scan 3, against the fit of all of it")
+    assert len(figure.axes) == 2 * len(noises)
+    assert drawn_points(figure) == len(cells)
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    page, words = figure.bbox, set()
+    for legend in figure.legends:
+        for text in legend.findobj(Text):
+            assert isinstance(text, Text)
+            box = text.get_window_extent()
+            assert page.x0 <= box.x0 <= box.x1 <= page.x1, text.get_text()
+            assert page.y0 <= box.y0 <= box.y1 <= page.y1, text.get_text()
+            words.add(text.get_text())
+    assert {"separable", "paper", "scipy lm", "somebody's", "4 cameras"} <= words
+    numbers = {text.get_text() for axes in figure.axes for text in axes.texts}
+    assert numbers == {"12", "48", "361"}
+
+
+def test_other_precisions_are_left_to_the_table() -> None:
+    cells = combinations(0.005)
+    more = [replace(c, precision="float16") for c in cells]
+    assert drawn_points(speed_error_figure([*cells, *more], title="")) == len(cells)
+
+
+def test_errors_that_no_axis_has_are_drawn_at_its_ends(tmp_path: Path) -> None:
+    cells = combinations(0.005)
+    strange = [
+        replace(cells[0], brdf_95=math.inf),
+        replace(cells[1], brdf_95=math.nan, brdf=math.nan),
+        replace(cells[2], brdf_95=0.0, brdf=0.0),
+        *cells[3:],
+    ]
+    figure = speed_error_figure(strange, title="")
+    for axes in figure.axes:
+        for line in axes.get_lines():
+            y = np.asarray(line.get_ydata(), dtype=float)
+            assert ((y >= 1e-5) & (y <= 1.0)).all()
+    picture = imread(plot_speed_error(strange, tmp_path / "a.png", title="strange"))
+    assert picture[..., :3].std() > 0.05  # not one even colour
