@@ -52,6 +52,7 @@ WITHIN = 1e-6
 OUT_OF_SIGHT = 1e6
 """Amplitude of a lobe, of the largest measured value, that no surface has."""
 PROCESSES = 2
+SHOWN = 5
 REFERENCE = f"trf 20 stratified starts, ftol 1e-15, scenes {VERSION}"
 
 
@@ -313,6 +314,7 @@ def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "within_in_sight": sum(o.within_in_sight for o in outcomes),
         "bound": upper_bound(len(missed), len(outcomes)),
         "missed": missed,
+        "missed_in_sight": [o.key for o in outcomes if not o.within_in_sight],
         "better": [o.key for o in outcomes if o.better],
         "truth_is_lower": [o.key for o in outcomes if o.truth_is_lower],
         "worst_excess": max(o.excess for o in outcomes),
@@ -345,10 +347,15 @@ def report(groups: dict[str, dict[str, Any]]) -> None:
         "  in sight: within, but for answers with a lobe that no surface has"
     )
     for name, g in groups.items():
-        for key in g["missed"]:
-            print(f"  missed, {name}: {key}")
-        for key in g["truth_is_lower"]:
-            print(f"  a descent from the truth ends lower, {name}: {key}")
+        beyond = [key for key in g["missed"] if key not in g["missed_in_sight"]]
+        for what, keys in (
+            ("missed", g["missed_in_sight"]),
+            ("missed, out of sight", beyond),
+            ("a descent from the truth ends lower", g["truth_is_lower"]),
+        ):
+            if keys:
+                more = f" and {len(keys) - SHOWN} more" if len(keys) > SHOWN else ""
+                print(f"  {name}: {what}: {'; '.join(keys[:SHOWN])}{more}")
 
 
 def main() -> dict[str, Any]:

@@ -6,7 +6,6 @@ GGX facets, or of cameras whose gains are off by 2 %, or both.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -248,7 +247,7 @@ def make_scene(key: str) -> Scene:
         phase=case.phase,
         gains=gains,
     )
-    plain = case.change in {outliers, constant, zero, negative} or case.truth[5] > 200
-    known = kind == TRUE and not plain and not math.isnan(noise) and "scale" not in name
+    spoilt = case.change in {outliers, constant, zero, negative} or "scale" in name
+    known = kind == TRUE and not spoilt and case.truth[5] <= 1 / SIGMA_S_BOUNDS[0]
     exact = noise == 0 or case.change is zero
     return Scene(key, case.change(observations), truth if known else None, exact)

@@ -323,7 +323,7 @@ def test_records_that_cannot_be_stored_are_refused(
         ({"covariance": np.ones(6)}, r"covariance have shape"),
         ({"parameter_names": ("kd_b",) * 6}, "are not unique"),
         ({"errors": {"rms": [1.0]}}, "error measure 'rms'"),
-        ({"model": "cook_torrance"}, "fit all with one model"),
+        ({"model": "cook_torrance", "details": {}}, "fit all with one model"),
     ],
 )
 def test_fits_that_cannot_be_stored_are_refused(

@@ -6,7 +6,9 @@ descends each, `amplitudes`, `equations` and `elementary` are what it is made of
 
 from __future__ import annotations
 
+import os
 import time
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -153,12 +155,14 @@ def compile_all() -> float:
 
 @cache
 def forget_stale_code() -> None:
-    """Delete compiled code on disk that is older than any of this folder's sources.
+    """Give all sources of this folder the time of the newest one.
 
-    numba looks at the file of a function alone, not at those of what it calls.
+    numba recompiles a function when the file that it stands in has another time than before; it
+    does not look at the files of what the function calls.
     """
-    folder = Path(__file__).parent
-    newest = max(path.stat().st_mtime for path in folder.glob("*.py"))
-    for index in (folder / "__pycache__").glob("*.nbi"):
-        if index.stat().st_mtime < newest:
-            index.unlink(missing_ok=True)
+    sources = {path: path.stat().st_mtime_ns for path in Path(__file__).parent.glob("*.py")}
+    newest = max(sources.values())
+    for path, changed_ns in sources.items():
+        if changed_ns != newest:
+            with suppress(OSError):  # an installation that can't be written is of one piece
+                os.utime(path, ns=(newest, newest))

@@ -18,11 +18,11 @@ from numba import njit
 from .elementary import JIT, clip
 from .equations import diffuse_coefficients
 
-ROUGHNESSES = 4
+ROUGHNESSES = 6
 """Values of s tried at every width."""
 COLD_ROUNDS, WARM_ROUNDS = 4, 2
 """Gauss-Newton rounds from no amplitude at all, and from nearly the right ones."""
-_REFINEMENTS = 9
+_REFINEMENTS = 25
 _DARK = 1e-12
 
 
@@ -96,15 +96,18 @@ def _pull(f, kd, ks):
 def best_at_width(x, form, diffuse, lobes, lower, upper, room):
     """Write the best s and amplitudes at the width of x; return the cost, less a constant.
 
-    s is bracketed on a grid, even in s / (s + 0.1), along which the model changes evenly, and
+    Also return an s in another valley of the grid, or -1 where there is none.
+
+    s is bracketed on a grid, even in s / (s + 0.25), along which the model changes evenly, and
     found there as the root of the cost's slope by the Illinois rule. `room` (6, 9) is overwritten.
     """
     forms, costs, slopes = room[:3], room[3], room[4]
     best = room[5, : x.shape[0]]
     if not upper[3] > lower[3]:
         x[3] = lower[3]
-        return improve_amplitudes(x, form, diffuse, lobes, lower, upper, COLD_ROUNDS, forms)[0]
-    first, last = lower[3] / (lower[3] + 0.1), upper[3] / (upper[3] + 0.1)
+        cost, _ = improve_amplitudes(x, form, diffuse, lobes, lower, upper, COLD_ROUNDS, forms)
+        return cost, -1.0
+    first, last = lower[3] / (lower[3] + 0.25), upper[3] / (upper[3] + 0.25)
     spacing = (last - first) / (ROUGHNESSES - 1)
     lowest, chosen = np.inf, 0
     for m in range(ROUGHNESSES):
@@ -117,10 +120,16 @@ def best_at_width(x, form, diffuse, lobes, lower, upper, room):
             lowest, chosen = costs[m], m
             best[:] = x
     x[:] = best
+    elsewhere, second = -1.0, np.inf
+    for m in range(ROUGHNESSES):
+        before = costs[m - 1] if m > 0 else np.inf
+        after = costs[m + 1] if m < ROUGHNESSES - 1 else np.inf
+        if m != chosen and costs[m] < before and costs[m] < after and costs[m] < second:
+            second, elsewhere = costs[m], _roughness(first + spacing * m, lower[3], upper[3])
     # the root lies on the side to which the slope at the lowest point falls
     other = chosen + (1 if slopes[chosen] < 0 else -1)
     if not 0 <= other < ROUGHNESSES or slopes[chosen] * slopes[other] >= 0:
-        return lowest
+        return lowest, elsewhere
     left, right = first + spacing * min(chosen, other), first + spacing * max(chosen, other)
     slope_left, slope_right = slopes[min(chosen, other)], slopes[max(chosen, other)]
     for _ in range(_REFINEMENTS):
@@ -140,12 +149,12 @@ def best_at_width(x, form, diffuse, lobes, lower, upper, room):
             right, slope_right = t, slope
             slope_left *= 0.5
     x[:] = best
-    return lowest
+    return lowest, elsewhere
 
 
 @njit(**JIT)
 def _roughness(t, lower, upper):
-    return clip(0.1 * t / (1 - t), lower, upper)
+    return clip(0.25 * t / (1 - t), lower, upper)
 
 
 @njit(**JIT)

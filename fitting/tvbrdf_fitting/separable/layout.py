@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ class Layout:
     specular: int
 
 
+@cache
 def layout_of(model: ReflectanceModel) -> Layout | None:
     """Return the layout of an Oren-Nayar or Lambert part, a Torrance-Sparrow lobe, or both.
 

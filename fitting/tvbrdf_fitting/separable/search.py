@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 
 from .amplitudes import (
+    COLD_ROUNDS,
     WARM_ROUNDS,
     best_at_width,
     improve_amplitudes,
@@ -42,6 +43,8 @@ VALLEYS = 6
 MAX_STEPS, SECOND_STEPS = 100, 25
 """Steps at most in the valley that looks deepest, and in others."""
 CONVERGED, STALLED, EXHAUSTED = 0, 1, 2
+_APART = 0.05
+"""Relative distance of two values of s that can lie in different valleys."""
 _BEND = 1e-5
 """Relative step above which amplitudes are made the best again."""
 
@@ -147,7 +150,7 @@ def width_count(lower, upper):
 def search(x, form, data, blocks, diffuse, lobes, energy, lower, upper, columns, tolerance):
     """Descend every valley that could hold the optimum, given all products; see `solve`."""
     size, widths = x.shape[0], lobes.shape[0]
-    triangles, room = np.empty((3, 9)), np.empty((6, 9))
+    triangles, products, room = np.empty((3, 9)), np.empty((3, 5)), np.empty((6, 9))
     costs, floors, points = np.full(widths, np.inf), np.empty(widths), np.empty((widths, size))
     triangulate(diffuse, triangles)
     for k in range(widths):
@@ -157,7 +160,7 @@ def search(x, form, data, blocks, diffuse, lobes, energy, lower, upper, columns,
         points[k, size - 1] = width_at(k, widths, lower, upper)
 
     first = int(np.argmin(floors))
-    costs[first] = best_at_width(points[first], form, diffuse, lobes[first], lower, upper, room)
+    costs[first], _ = best_at_width(points[first], form, diffuse, lobes[first], lower, upper, room)
     x[:] = points[first]
     best, evaluations, status = descend(
         x, form, data, blocks, diffuse, lower, upper, columns, tolerance, MAX_STEPS
@@ -167,7 +170,7 @@ def search(x, form, data, blocks, diffuse, lobes, energy, lower, upper, columns,
     margin = 1e-9 * best + 1e-13 * energy
     for k in range(widths):
         if k != first and floors[k] < best + margin:
-            costs[k] = best_at_width(points[k], form, diffuse, lobes[k], lower, upper, room)
+            costs[k], _ = best_at_width(points[k], form, diffuse, lobes[k], lower, upper, room)
     bottoms = np.full(widths, np.inf)  # of a plateau its last point
     for k in range(widths):
         if (k == 0 or costs[k] <= costs[k - 1]) and (k == widths - 1 or costs[k] < costs[k + 1]):
@@ -181,6 +184,24 @@ def search(x, form, data, blocks, diffuse, lobes, energy, lower, upper, columns,
         bottoms[chosen] = np.inf
         start[:] = points[chosen]
         # a valley is nearly as deep at its best grid point as at its bottom
+        cost, spent, state = descend(
+            start, form, data, blocks, diffuse, lower, upper, columns, tolerance, SECOND_STEPS
+        )
+        valleys += 1
+        evaluations += spent
+        if cost < best:
+            best, status = cost, state
+            x[:] = start
+    # dark surfaces can have two valleys of s at one width
+    start[:] = x
+    write_lobe_products(x[size - 1], data, blocks, columns[0], products)
+    _, elsewhere = best_at_width(start, form, diffuse, products, lower, upper, room)
+    other = abs(start[3] - x[3]) > _APART * (0.1 + x[3])
+    if not other and elsewhere >= 0:
+        other = True
+        start[3] = elsewhere
+        improve_amplitudes(start, form, diffuse, products, lower, upper, COLD_ROUNDS, room[:3])
+    if other:
         cost, spent, state = descend(
             start, form, data, blocks, diffuse, lower, upper, columns, tolerance, SECOND_STEPS
         )
