@@ -68,9 +68,11 @@ def test_a_few_broken_lines_from_the_arm_do_no_harm(rig: Rig, kind: str) -> None
 def test_an_arm_that_is_gone_for_good_ends_the_run_by_name(rig: Rig, kind: str, said: str) -> None:
     assert launch(rig, arm=({"kind": kind, **MIDWAY},)) == 1, rig.text()
     text = rig.text()
+    # which the sequencer hears first, the broken sweep or the end of the arm's node, is chance
     first = next(line for line in text.splitlines() if line.startswith("sequencer: warning: "))
-    assert first.startswith("sequencer: warning: scan 1 sweep 1: arm: ")
-    assert said in first
+    starts = ("sequencer: warning: scan 1 sweep 1: arm: ", "sequencer: warning: arm is gone")
+    assert first.startswith(starts)
+    assert said in text
     assert "Traceback" not in text
     assert text.count("tvbrdf: error: ") == 1
     assert rig.sample().scans == ()

@@ -61,6 +61,7 @@ def test_unplugged(make_arm_rig: Make) -> None:
 def test_plugged_in_again(make_arm_rig: Make) -> None:
     rig, number = sweep_with(make_arm_rig, {"kind": "unplug", "at_sweep": 1, "for_s": 0.1})
     fails_with(rig, number, "port is gone")
+    rig.pace_s = 0.005  # else the command is too late, on the run's clock, when the port is back
     rig.kill("arm")
     rig.start("arm")  # waits for the port
     result = rig.do("jog", to_deg=1.0)
@@ -114,7 +115,8 @@ def test_late_answers_are_waited_for_and_nothing_is_done_twice(make_arm_rig: Mak
 
 @pytest.mark.parametrize("repeated", [True, False])
 def test_lost_answer_to_a_motion(make_arm_rig: Make, repeated: bool) -> None:
-    rig = make_arm_rig(arm={**QUICK, "attempts": 5}).start_all().homed()
+    # many attempts: on a busy machine a few time-outs may pass while nobody is at fault
+    rig = make_arm_rig(arm={**QUICK, "attempts": 50}).start_all().homed()
     twin, arm = rig.runners["arm_controller"].node, rig.runners["arm"]
     rig.hold_time = True
     before = twin.diagnostics()["requests"]
@@ -127,7 +129,8 @@ def test_lost_answer_to_a_motion(make_arm_rig: Make, repeated: bool) -> None:
         rig.run(lambda: arm.node.diagnostics()["requests_repeated"] > 0, "asking again")
     rig.hold_time = False  # if it was not asked again, the motion's end tells that it was accepted
     rig.run(lambda: rig.results(number))
-    assert rig.results(number)[0].state == "done"
+    result = rig.results(number)[0]
+    assert (result.state, result.reason) == ("done", "")
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.9])
