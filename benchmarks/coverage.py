@@ -23,13 +23,13 @@ from tvbrdf_fitting.geometry import (
     light_direction,
     view_direction,
 )
+from tvbrdf_fitting.inference.nuisances import CommonErrors, make_nuisances
+from tvbrdf_fitting.inference.posterior import Posterior, linearise_at
+from tvbrdf_fitting.inference.uncertainty import estimate
 from tvbrdf_fitting.models import SURFACE, get_model
-from tvbrdf_fitting.nuisances import CommonErrors, make_nuisances
 from tvbrdf_fitting.observations import Observations
-from tvbrdf_fitting.posterior import Posterior, linearise_at
 from tvbrdf_fitting.problem import make_problem
 from tvbrdf_fitting.result import FitResult
-from tvbrdf_fitting.uncertainty import estimate
 
 SCENES = 2000
 GAIN_STD, OFFSET_STD_DEG = 0.005, 0.02

@@ -41,7 +41,7 @@ from benchmarks.fit_timing import on_one_thread, write_figures
 from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_fitting.problem import Problem, make_problem
-from tvbrdf_fitting.solvers import SOLVERS
+from tvbrdf_fitting.solve.solvers import SOLVERS
 
 STARTS = 20
 SCENES, FULL = 120, 2000

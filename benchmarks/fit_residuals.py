@@ -16,8 +16,8 @@ from numba import njit
 
 from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.problem import Problem
-from tvbrdf_fitting.separable.elementary import JIT, exp_negative
-from tvbrdf_fitting.separable.layout import data_of, layout_of
+from tvbrdf_fitting.solve.separable.elementary import JIT, exp_negative
+from tvbrdf_fitting.solve.separable.layout import data_of, layout_of
 from tvbrdf_launch.cli.bench.contestants import generic_start
 
 PARAMETERS = 6

@@ -30,8 +30,8 @@ from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.problem import Problem, make_problem
-from tvbrdf_fitting.separable import compile_all
-from tvbrdf_fitting.solvers import SOLVERS
+from tvbrdf_fitting.solve.separable import compile_all
+from tvbrdf_fitting.solve.solvers import SOLVERS
 from tvbrdf_launch.cli.bench.rig_scenes import measure, random_material
 
 SATIN = (0.3, 0.5, 0.7, 0.4, 0.8, 6.0)

@@ -24,8 +24,8 @@ from benchmarks.fit_timing import on_one_thread, take_turns, write_figures
 from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_fitting.problem import Problem, make_problem
-from tvbrdf_fitting.separable import compile_all
-from tvbrdf_fitting.solvers import SOLVERS
+from tvbrdf_fitting.solve.separable import compile_all
+from tvbrdf_fitting.solve.solvers import SOLVERS
 from tvbrdf_launch.cli.bench.rig_scenes import log_uniform, measure
 
 SCENES = 40

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from tvbrdf_fitting import FitResult, fit_scan
+from tvbrdf_fitting.choice.choose import choose_model
 from tvbrdf_fitting.error_measures import LOG_SMALLEST_VALUE, ErrorMeasures
 from tvbrdf_fitting.geometry import CHANNELS, BoolArray, FloatArray
-from tvbrdf_fitting.model_choice import choose_model
 from tvbrdf_fitting.models import COLOURED, SURFACE, get_model
 from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.problem import make_problem

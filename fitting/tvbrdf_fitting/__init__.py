@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .batch import ParameterBatch, fit_parameters
-    from .design import find_designs
+    from .choice.choose import ModelChoice, choose_for_series, choose_model
+    from .design.search import find_designs
     from .error_measures import ErrorMeasures, measure_errors, pool
     from .fit import fit_scan
+    from .inference.nuisances import CommonErrors
     from .many_scans import fit_scans
-    from .model_choice import ModelChoice, choose_for_series, choose_model
     from .models import get_model
-    from .nuisances import CommonErrors
     from .observations import Observations
     from .prediction import predict, predict_over_models
     from .problem import FitError
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from .result import FitResult
 
 _MODULES = {
-    "CommonErrors": "nuisances",
+    "CommonErrors": "inference.nuisances",
     "ErrorMeasures": "error_measures",
     "FitError": "problem",
     "FitResult": "result",
-    "ModelChoice": "model_choice",
+    "ModelChoice": "choice.choose",
     "Observations": "observations",
     "ParameterBatch": "batch",
-    "choose_for_series": "model_choice",
-    "choose_model": "model_choice",
-    "find_designs": "design",
+    "choose_for_series": "choice.choose",
+    "choose_model": "choice.choose",
+    "find_designs": "design.search",
     "fit_parameters": "batch",
     "fit_scan": "fit",
     "fit_scans": "many_scans",

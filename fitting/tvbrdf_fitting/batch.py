@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import separable
 from .geometry import BoolArray, FloatArray, IntArray, above_horizon
 from .models import SURFACE, ReflectanceModel, get_model
 from .observations import Observations
 from .problem import Problem, make_problem
-from .solvers import SOLVERS
+from .solve import separable
+from .solve.solvers import SOLVERS
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from .determined import bounds_reached, undetermined
 from .error_measures import measure_errors
 from .geometry import FloatArray
-from .losses import LOSSES, fit_reweighted
-from .marginal import Asked, Marginal, marginalise
+from .inference.determined import bounds_reached, undetermined
+from .inference.marginal import Asked, Marginal, marginalise
+from .inference.nuisances import CommonErrors, Nuisances, make_nuisances
+from .inference.uncertainty import estimate, published_scale, to_published
 from .metrics import METRICS
 from .models import SURFACE, ReflectanceModel, get_model
-from .nuisances import CommonErrors, Nuisances, make_nuisances
 from .observations import Observations
 from .problem import FitError, Problem, Solution, Solver, make_problem
 from .result import FitResult
-from .solvers import SOLVERS
-from .uncertainty import estimate, published_scale, to_published
+from .solve.losses import LOSSES, fit_reweighted
+from .solve.solvers import SOLVERS
 
 
 def fit_scan(

@@ -33,17 +33,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .choice.choose import ModelChoice
+from .choice.ladder import DEFAULT_LADDER, Scan, as_ladder, find
+from .choice.rule import DECISIVE
 from .geometry import BoolArray, FloatArray
 from .half_angle import paired
-from .model_choice import ModelChoice
-from .model_ladder import DEFAULT_LADDER, Scan, as_ladder, find
-from .model_rule import DECISIVE
+from .inference.nuisances import CommonErrors
+from .inference.posterior import Posterior, maximise
+from .inference.uncertainty import estimate
 from .models import ReflectanceModel, get_model
-from .nuisances import CommonErrors
 from .observations import Observations
-from .posterior import Posterior, maximise
 from .result import FitResult
-from .uncertainty import estimate
 
 _ALLOWED = 0.5
 """Rise of the cost, half of chi-square, up to which the data allow a lobe's width."""
@@ -164,7 +164,7 @@ def weigh(results: Sequence[FitResult]) -> tuple[Contender, ...]:
 
     ``chi-square / c + k ln n`` with k free parameters of n values; c, at least 1, is what the best
     fit leaves per degree of freedom (Burnham and Anderson's variance factor). Weights are
-    ``exp(-difference / 2)``; differences of `model_rule.DECISIVE` and more are left out.
+    ``exp(-difference / 2)``; differences of `choice.rule.DECISIVE` and more are left out.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def contenders(
 ) -> tuple[Contender, ...]:
     """Return the fits that explain a scan as well as the one that was kept.
 
-    Those are the rungs whose criterion is less than `model_rule.DECISIVE` above the kept one's: of
+    Those are the rungs whose criterion is less than `choice.rule.DECISIVE` above the kept one's: of
     all that were tried for the choice, and of those with as many parameters, as another shape of
     lobe, that need not have been. One with a lower criterion counts the same as the kept one: by
     the rule the difference does not decide, or what it adds is no highlight.

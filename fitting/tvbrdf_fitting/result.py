@@ -15,7 +15,7 @@ from .geometry import FloatArray
 from .models import get_model
 
 if TYPE_CHECKING:
-    from .marginal import Optimum
+    from .inference.marginal import Optimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class FitResult:
             `sigmas` is not a positive number, or a profile is needed and the result no longer has
             the data, as after pickling.
         """
-        from .profile_likelihood import interval
+        from .inference.profile_likelihood import interval
 
         return interval(self, name, sigmas)
 

@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tvbrdf_fitting.calibration import CameraCalibration
+    from tvbrdf_fitting.measurement.calibration import CameraCalibration
     from tvbrdf_messages.messages import Frame
 
 BINS = 32

@@ -24,7 +24,7 @@ def write_truth(graph: Graph) -> bool:
     writers = [p for p in graph.participants if "/scan/stored" in p.gives]
     if not scene_file.is_file() or not writers:
         return False
-    from tvbrdf_fitting.published_database import DatabaseError, read_database
+    from tvbrdf_fitting.published.database import DatabaseError, read_database
     from tvbrdf_nodes.world.sample import make_sample
 
     folder = Path(writers[0].parameters["path"])

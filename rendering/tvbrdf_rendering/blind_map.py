@@ -23,8 +23,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
+from tvbrdf_fitting.choice.choose import ModelChoice
 from tvbrdf_fitting.half_angle import from_half_angles, to_half_angles
-from tvbrdf_fitting.model_choice import ModelChoice
 from tvbrdf_fitting.models import get_model
 from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.prediction import Contender, contenders, predict_over_models

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tvbrdf_fitting.models import get_model
 from tvbrdf_fitting.published import CameraScan
-from tvbrdf_fitting.published_database import DatabaseError, StoredFit, StoredSample, StoredScan
+from tvbrdf_fitting.published.database import DatabaseError, StoredFit, StoredSample, StoredScan
 
 from .style import (
     CHANNEL_COLOURS,

@@ -20,13 +20,13 @@ from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.models import get_model
 from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.published import write_atomically
-from tvbrdf_fitting.published_database import StoredFit, StoredSample, StoredScan
+from tvbrdf_fitting.published.database import StoredFit, StoredSample, StoredScan
 from tvbrdf_fitting.result import FitResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tvbrdf_fitting.model_choice import ModelChoice
+    from tvbrdf_fitting.choice.choose import ModelChoice
 
 DataSource = Literal["frames", "grid"]
 SIGNIFICANT = 3.0

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from tvbrdf_fitting.published_database import DatabaseError, StoredSample
+from tvbrdf_fitting.published.database import DatabaseError, StoredSample
 
 from .style import (
     CHANNEL_COLOURS,

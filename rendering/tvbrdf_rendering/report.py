@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tvbrdf_fitting.published_database import read_database
+from tvbrdf_fitting.published.database import read_database
 
 from .summary import write_summary
 from .truth import read_truth

@@ -12,7 +12,7 @@ from typing import Any
 
 from tvbrdf_fitting.error_measures import ErrorMeasures, pool
 from tvbrdf_fitting.published import write_atomically
-from tvbrdf_fitting.published_database import StoredDatabase, StoredFit, StoredSample, read_database
+from tvbrdf_fitting.published.database import StoredDatabase, StoredFit, StoredSample, read_database
 
 from .truth import Truth, read_truth
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tvbrdf_fitting.published_database import DatabaseError
+from tvbrdf_fitting.published.database import DatabaseError
 
 TRUTH_FILE = "truth.json"
 

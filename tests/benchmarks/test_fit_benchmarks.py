@@ -22,7 +22,7 @@ from benchmarks.fit_starts import summary
 from benchmarks.fit_timing import take_turns
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_fitting.problem import make_problem
-from tvbrdf_fitting.solvers import SOLVERS
+from tvbrdf_fitting.solve.solvers import SOLVERS
 
 SATIN = (0.3, 0.5, 0.7, 0.4, 0.8, 6.0)
 FOUND = Reference("abc", (2.0, 1.0, 3.0), (0.5, 0.2, 1e9), 1.5, 0.25)

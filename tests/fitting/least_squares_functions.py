@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tvbrdf_fitting.levenberg_marquardt import LeastSquaresSolution, levenberg_marquardt
+from tvbrdf_fitting.solve.levenberg_marquardt import LeastSquaresSolution, levenberg_marquardt
 
 Array = np.ndarray[Any, Any]
 Function = Callable[[Array], Array]

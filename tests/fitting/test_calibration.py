@@ -12,7 +12,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tvbrdf_fitting.calibration import (
+from tvbrdf_fitting.geometry import view_direction
+from tvbrdf_fitting.measurement.calibration import (
     Calibration,
     CalibrationError,
     Rectangle,
@@ -20,7 +21,6 @@ from tvbrdf_fitting.calibration import (
     load_calibration,
     parse_calibration,
 )
-from tvbrdf_fitting.geometry import view_direction
 
 FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tvbrdf_fitting.calibration import HardwareStampEvent, load_calibration
-from tvbrdf_fitting.clock_model import (
+from tvbrdf_fitting.measurement.calibration import HardwareStampEvent, load_calibration
+from tvbrdf_fitting.measurement.clock_model import (
     ClockError,
     ClockStepError,
     fit_clock,

@@ -12,8 +12,8 @@ import pytest
 from scipy.stats import chi2
 
 from tvbrdf_fitting import CommonErrors, fit_scan, get_model
-from tvbrdf_fitting.calibration import load_calibration
-from tvbrdf_fitting.design import (
+from tvbrdf_fitting.design.fisher_information import Information, NoiseModel, Rig
+from tvbrdf_fitting.design.search import (
     PHASES,
     Accuracy,
     Design,
@@ -23,9 +23,9 @@ from tvbrdf_fitting.design import (
     make_design,
     meaningless,
 )
-from tvbrdf_fitting.design_simulation import confirm, simulate_design
-from tvbrdf_fitting.fisher_information import Information, NoiseModel, Rig
+from tvbrdf_fitting.design.simulation import confirm, simulate_design
 from tvbrdf_fitting.geometry import above_horizon, light_direction
+from tvbrdf_fitting.measurement.calibration import load_calibration
 
 EXPOSURES_MS = (0.2, 4.0, 32.0)
 MATTE = [0.3, 0.5, 0.7, 0.4, 0.02, 3.0]

@@ -17,7 +17,7 @@ import tvbrdf_fitting
 from tvbrdf_fitting import CommonErrors, FitError, FitResult, Observations, fit_scan, get_model
 from tvbrdf_fitting.fit import SOLVERS
 from tvbrdf_fitting.problem import make_problem
-from tvbrdf_fitting.solvers import solve_trust_region
+from tvbrdf_fitting.solve.solvers import solve_trust_region
 
 Simulate = Callable[..., Observations]
 

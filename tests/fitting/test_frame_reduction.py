@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tvbrdf_fitting.calibration import CameraCalibration, Rectangle, load_calibration
-from tvbrdf_fitting.frame_reduction import FrameReducer, is_saturated, reduce_frame
-from tvbrdf_fitting.response import Response
+from tvbrdf_fitting.measurement.calibration import CameraCalibration, Rectangle, load_calibration
+from tvbrdf_fitting.measurement.frame_reduction import FrameReducer, is_saturated, reduce_frame
+from tvbrdf_fitting.measurement.response import Response
 
 FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
 CAMERA = load_calibration(FILE).camera(1)

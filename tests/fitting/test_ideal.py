@@ -7,7 +7,7 @@ import pytest
 
 from tvbrdf_fitting.models import SumModel, get_model
 from tvbrdf_fitting.models.ideal import DeltaLobe, IdealMirror, IdealRefraction, delta_lobes
-from tvbrdf_fitting.optics import fresnel_dielectric
+from tvbrdf_fitting.models.optics import fresnel_dielectric
 
 GLASS = 1.5
 SURFACE = "ideal_mirror(dielectric)+ideal_refraction"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tvbrdf_fitting.independent_values import correlation, nested_blocks
+from tvbrdf_fitting.choice.independent_values import correlation, nested_blocks
 
 
 class TestIndependentValues:

@@ -26,7 +26,7 @@ from tests.fitting.least_squares_functions import (
     solve,
     wood,
 )
-from tvbrdf_fitting.levenberg_marquardt import LeastSquaresError, levenberg_marquardt
+from tvbrdf_fitting.solve.levenberg_marquardt import LeastSquaresError, levenberg_marquardt
 
 # from ten times as far: Beale's, Bard's and Box's functions then fall to infinity, and Jennrich's
 # and Sampson's loses all digits of its data

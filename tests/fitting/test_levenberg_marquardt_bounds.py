@@ -18,7 +18,7 @@ from tests.fitting.least_squares_functions import (
     solve,
     wood,
 )
-from tvbrdf_fitting.levenberg_marquardt import LeastSquaresError, levenberg_marquardt
+from tvbrdf_fitting.solve.levenberg_marquardt import LeastSquaresError, levenberg_marquardt
 
 
 @dataclass(frozen=True)

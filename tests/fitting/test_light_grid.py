@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tvbrdf_fitting.calibration import Calibration, load_calibration
 from tvbrdf_fitting.geometry import light_direction
-from tvbrdf_fitting.light_grid import (
+from tvbrdf_fitting.measurement.calibration import Calibration, load_calibration
+from tvbrdf_fitting.measurement.light_grid import (
     grid_angles_deg,
     interpolate,
     merge_on_grid,
     visible_positions,
 )
-from tvbrdf_fitting.scan_merge import ScanObservations
+from tvbrdf_fitting.measurement.scan_merge import ScanObservations
 
 FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
 FloatArray = NDArray[np.float64]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tvbrdf_fitting.light_offset import SweepCurve, light_offset_from_opposite_sweeps
+from tvbrdf_fitting.measurement.light_offset import SweepCurve, light_offset_from_opposite_sweeps
 
 FloatArray = NDArray[np.float64]
 SPEED_DEG_S = 15.0

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tvbrdf_fitting.light_path import LightPath
+from tvbrdf_fitting.measurement.light_path import LightPath
 
 UTC_NS = 1_800_000_000_123_456_789
 FloatArray = NDArray[np.float64]

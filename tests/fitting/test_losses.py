@@ -11,10 +11,11 @@ from scipy.integrate import quad
 from scipy.optimize import least_squares
 from scipy.stats import binomtest, norm
 
-from tvbrdf_fitting import Observations, fit_scan, get_model, losses
+from tvbrdf_fitting import Observations, fit_scan, get_model
 from tvbrdf_fitting.fit import METRICS, SOLVERS
-from tvbrdf_fitting.losses import CAUCHY, HUBER, LOSSES
 from tvbrdf_fitting.problem import make_problem
+from tvbrdf_fitting.solve import losses
+from tvbrdf_fitting.solve.losses import CAUCHY, HUBER, LOSSES
 
 Simulate = Callable[..., Observations]
 

@@ -17,9 +17,9 @@ import pytest
 from scipy.stats import binomtest
 
 from tvbrdf_fitting import CommonErrors, FitError, Observations, get_model
-from tvbrdf_fitting.model_choice import ModelChoice, choose_for_series, choose_model
-from tvbrdf_fitting.model_ladder import DEFAULT_LADDER, Candidate, as_ladder, find
-from tvbrdf_fitting.model_rule import DECISIVE, HIGHLIGHT, MATTERS, SWITCH
+from tvbrdf_fitting.choice.choose import ModelChoice, choose_for_series, choose_model
+from tvbrdf_fitting.choice.ladder import DEFAULT_LADDER, Candidate, as_ladder, find
+from tvbrdf_fitting.choice.rule import DECISIVE, HIGHLIGHT, MATTERS, SWITCH
 from tvbrdf_fitting.time_varying import DryingPaint
 
 Simulate = Callable[..., Observations]

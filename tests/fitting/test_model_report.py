@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from tvbrdf_fitting.albedo import KINDS, directional_albedo, spread, symmetries, unit
-from tvbrdf_fitting.bihemispherical import hemispherical_reflectance
 from tvbrdf_fitting.geometry import FloatArray, IntArray
-from tvbrdf_fitting.model_report import ModelReport, check_model
-from tvbrdf_fitting.model_trials import ENERGY_LIMIT, RECIPROCITY_LIMIT
 from tvbrdf_fitting.models import Lambert, ReflectanceModel, catalogue, get_model
-from tvbrdf_fitting.quadrature import RULE_7, RULE_15, Integral, Rule, integrate
+from tvbrdf_fitting.properties.albedo import KINDS, directional_albedo, spread, symmetries, unit
+from tvbrdf_fitting.properties.bihemispherical import hemispherical_reflectance
+from tvbrdf_fitting.properties.quadrature import RULE_7, RULE_15, Integral, Rule, integrate
+from tvbrdf_fitting.properties.report import ModelReport, check_model
+from tvbrdf_fitting.properties.trials import ENERGY_LIMIT, RECIPROCITY_LIMIT
 
 ANGLES = np.deg2rad([0.0, 20.0, 50.0, 75.0, 88.0])
 PURE_DUST = "dust+lambert+torrance_sparrow"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.fitting.nist_problems import MODELS, NistProblem, read_nist
-from tvbrdf_fitting.levenberg_marquardt import LeastSquaresSolution, levenberg_marquardt
+from tvbrdf_fitting.solve.levenberg_marquardt import LeastSquaresSolution, levenberg_marquardt
 
 NAMES = sorted(MODELS)
 HAS_LONGDOUBLE = np.finfo(np.longdouble).eps < 1e-18

@@ -11,7 +11,7 @@ import pytest
 from mpmath import mp, mpf
 from scipy.integrate import quad
 
-from tvbrdf_fitting.optics import (
+from tvbrdf_fitting.models.optics import (
     eta_of_normal_reflectance,
     fresnel_conductor,
     fresnel_conductor_slopes,

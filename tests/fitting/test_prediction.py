@@ -11,9 +11,9 @@ import pytest
 from scipy.stats import chi2
 
 from tvbrdf_fitting import CommonErrors, FitResult, Observations, fit_scan, get_model
+from tvbrdf_fitting.choice.choose import choose_model
+from tvbrdf_fitting.choice.rule import DECISIVE
 from tvbrdf_fitting.half_angle import from_half_angles
-from tvbrdf_fitting.model_choice import choose_model
-from tvbrdf_fitting.model_rule import DECISIVE
 from tvbrdf_fitting.prediction import (
     Contender,
     contenders,

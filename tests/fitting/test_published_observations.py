@@ -27,7 +27,7 @@ from tvbrdf_fitting.published import (
     scan_file_name,
     write_scan_file,
 )
-from tvbrdf_fitting.published_checks import (
+from tvbrdf_fitting.published.checks import (
     check_cameras,
     check_files,
     check_name,
@@ -37,7 +37,7 @@ from tvbrdf_fitting.published_checks import (
     diffuse_colour,
     order_of,
 )
-from tvbrdf_fitting.published_observations import ROUNDING, SMALLEST_RELATIVE
+from tvbrdf_fitting.published.observations import ROUNDING, SMALLEST_RELATIVE
 
 EXPOSURES_MS = (0.2, 4.0, 32.0)
 TRUTH = (0.08, 0.2, 0.45, 0.3, 0.6, 9.0)

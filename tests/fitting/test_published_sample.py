@@ -31,7 +31,7 @@ from tvbrdf_fitting.published import (
     write_parameters,
     write_scan_file,
 )
-from tvbrdf_fitting.published_sample import format_parameters
+from tvbrdf_fitting.published.sample import format_parameters
 
 INFO = SampleInfo(
     sample_name="blue paint (glossy)",

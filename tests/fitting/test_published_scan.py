@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tvbrdf_fitting import published_scan
 from tvbrdf_fitting.published import (
     CameraScan,
     PublishedFormatError,
@@ -23,6 +22,7 @@ from tvbrdf_fitting.published import (
     scan_file_name,
     write_scan_file,
 )
+from tvbrdf_fitting.published import scan as published_scan
 
 HALF_MICRO = 0.5e-6 * (1 + 1e-9)
 """Rounding to 6 decimals."""

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tvbrdf_fitting.response import Response, largest_code
+from tvbrdf_fitting.measurement.response import Response, largest_code
 
 bit_depths = st.integers(8, 16)
 increasing = st.lists(st.floats(0.01, 1.0), min_size=1, max_size=12)

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvbrdf_fitting import Observations, separable
+from tvbrdf_fitting import Observations
 from tvbrdf_fitting.batch import fit_parameters
 from tvbrdf_fitting.models import COLOURED, SURFACE, get_model
 from tvbrdf_fitting.problem import FitError, Problem, make_problem
-from tvbrdf_fitting.separable import elementary, equations, search
-from tvbrdf_fitting.separable.layout import data_of, layout_of
-from tvbrdf_fitting.solvers import SOLVERS
+from tvbrdf_fitting.solve import separable
+from tvbrdf_fitting.solve.separable import elementary, equations, search
+from tvbrdf_fitting.solve.separable.layout import data_of, layout_of
+from tvbrdf_fitting.solve.solvers import SOLVERS
 
 Simulate = Callable[..., Observations]
 

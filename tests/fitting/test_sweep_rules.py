@@ -8,11 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tvbrdf_fitting.calibration import load_calibration
-from tvbrdf_fitting.frame_reduction import PatchStatistics, RegionStatistics
-from tvbrdf_fitting.light_path import LightPath
-from tvbrdf_fitting.radiometry import RegionRadiance, dark_level, lamp_factor, region_radiance
-from tvbrdf_fitting.scan_merge import FrameRecord, SweepObservations, sweep_observations
+from tvbrdf_fitting.measurement.calibration import load_calibration
+from tvbrdf_fitting.measurement.frame_reduction import PatchStatistics, RegionStatistics
+from tvbrdf_fitting.measurement.light_path import LightPath
+from tvbrdf_fitting.measurement.radiometry import (
+    RegionRadiance,
+    dark_level,
+    lamp_factor,
+    region_radiance,
+)
+from tvbrdf_fitting.measurement.scan_merge import FrameRecord, SweepObservations, sweep_observations
 
 FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
 CALIBRATION = load_calibration(FILE)

@@ -13,11 +13,11 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tvbrdf_fitting import CommonErrors, FitResult, Observations, fit_scan, get_model
-from tvbrdf_fitting.nuisances import make_nuisances
-from tvbrdf_fitting.posterior import Posterior, linearise_at, maximise
+from tvbrdf_fitting.inference.nuisances import make_nuisances
+from tvbrdf_fitting.inference.posterior import Posterior, linearise_at, maximise
+from tvbrdf_fitting.inference.uncertainty import estimate
 from tvbrdf_fitting.problem import Problem, make_problem
-from tvbrdf_fitting.solvers import SOLVERS
-from tvbrdf_fitting.uncertainty import estimate
+from tvbrdf_fitting.solve.solvers import SOLVERS
 
 Simulate = Callable[..., Observations]
 

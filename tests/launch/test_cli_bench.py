@@ -18,7 +18,7 @@ from tvbrdf_fitting.geometry import CAMERA_ANGLES_DEG, light_direction, view_dir
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_fitting.problem import make_problem
 from tvbrdf_fitting.published import CameraScan, scan_file_name, write_scan_file
-from tvbrdf_fitting.solvers import SOLVERS
+from tvbrdf_fitting.solve.solvers import SOLVERS
 from tvbrdf_launch.cli import bench
 from tvbrdf_launch.cli.bench import grid, table
 from tvbrdf_launch.cli.bench.contestants import CONTESTANTS, Contestant, rounded, single_start

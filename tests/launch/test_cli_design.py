@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from tvbrdf_fitting import fit_scan, get_model
-from tvbrdf_fitting.fisher_information import Rig
-from tvbrdf_fitting.model_choice import choose_model
+from tvbrdf_fitting.choice.choose import choose_model
+from tvbrdf_fitting.design.fisher_information import Rig
 from tvbrdf_launch import cli
 from tvbrdf_launch.cli import design
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tvbrdf_fitting.calibration import load_calibration
+from tvbrdf_fitting.measurement.calibration import load_calibration
 from tvbrdf_launch.display import Display, TimeLeft
 from tvbrdf_launch.errors import RunError
 from tvbrdf_launch.process_table import (

@@ -16,7 +16,7 @@ import pytest
 
 from tvbrdf_fitting.models import DUST, SURFACE, get_model
 from tvbrdf_fitting.published import CameraScan, read_parameters, read_sample
-from tvbrdf_fitting.published_database import MissingScan
+from tvbrdf_fitting.published.database import MissingScan
 from tvbrdf_nodes.database_writer.store import (
     DatabaseError,
     DatabaseStore,

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from tvbrdf_fitting.published import CameraScan, list_scans, read_sample
-from tvbrdf_fitting.published_sample import SURFACE_PARAMETERS
+from tvbrdf_fitting.published.sample import SURFACE_PARAMETERS
 from tvbrdf_nodes.database_writer.store import (
     DatabaseError,
     DatabaseStore,

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from tvbrdf_fitting.geometry import CAMERA_ANGLES_DEG, light_direction, view_direction
-from tvbrdf_fitting.light_grid import grid_angles_deg
+from tvbrdf_fitting.measurement.light_grid import grid_angles_deg
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_fitting.published import read_parameters
-from tvbrdf_fitting.published_database import StoredSample, read_database
+from tvbrdf_fitting.published.database import StoredSample, read_database
 from tvbrdf_messages.messages import (
     DatabaseState,
     Mark,

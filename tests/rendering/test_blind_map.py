@@ -14,9 +14,9 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 from tvbrdf_fitting import FitResult, Observations, fit_scan, get_model
-from tvbrdf_fitting.fisher_information import Rig
+from tvbrdf_fitting.choice.choose import choose_model
+from tvbrdf_fitting.design.fisher_information import Rig
 from tvbrdf_fitting.half_angle import from_half_angles
-from tvbrdf_fitting.model_choice import choose_model
 from tvbrdf_fitting.prediction import predict
 from tvbrdf_rendering.blind_map import (
     LARGEST,

@@ -12,8 +12,8 @@ from matplotlib.image import imread
 
 from tests.rendering.test_report import check_labels
 from tvbrdf_fitting import FitResult, Observations, fit_scan
+from tvbrdf_fitting.choice.choose import choose_model
 from tvbrdf_fitting.geometry import above_horizon, light_direction, view_direction
-from tvbrdf_fitting.model_choice import choose_model
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_rendering.fit_curves import camera_curves, fit_curves_figure, residuals
 from tvbrdf_rendering.fit_report import (

@@ -17,7 +17,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
-from tvbrdf_fitting.published_database import (
+from tvbrdf_fitting.published.database import (
     DatabaseError,
     StoredDatabase,
     StoredFit,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tvbrdf_fitting.published_database import DatabaseError, read_database
+from tvbrdf_fitting.published.database import DatabaseError, read_database
 from tvbrdf_rendering.summary import (
     format_summary,
     pooled_errors,

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from tvbrdf_fitting.published_database import StoredSample, read_database
+from tvbrdf_fitting.published.database import StoredSample, read_database
 from tvbrdf_launch.process_table import ProcessTable, read_processes
 from tvbrdf_messages.bus.watcher import Watcher
 from tvbrdf_messages.run_directory import Graph, read_graph

@@ -29,15 +29,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..geometry import FloatArray
-from ..optics import (
+from .base import LOG, Parameter, Transform
+from .facets import GGX, Basis, Beckmann, Facets, basis
+from .lobe import Lobe
+from .optics import (
     conductor_reflectance,
     conductor_reflectance_slopes,
     dielectric_reflectance,
     dielectric_reflectance_slope,
 )
-from .base import LOG, Parameter, Transform
-from .facets import GGX, Basis, Beckmann, Facets, basis
-from .lobe import Lobe
 from .registry import Registration, label
 
 ALPHA_BOUNDS = (0.005, 1.5)

@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..geometry import FloatArray
-from ..optics import fresnel_dielectric, radiance_scale, reflect, refract, transmittance_dielectric
 from .base import LOG, Parameter, ReflectanceModel
 from .combination import SumModel
+from .optics import fresnel_dielectric, radiance_scale, reflect, refract, transmittance_dielectric
 from .registry import Registration, label
 
 _REFLECTANCE = Parameter("reflectance", "1", 0.0, 1.0, typical=0.7).one_a_channel()

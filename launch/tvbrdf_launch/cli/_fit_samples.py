@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.model_choice import ModelChoice
-    from tvbrdf_fitting.nuisances import CommonErrors
+    from tvbrdf_fitting.choice.choose import ModelChoice
+    from tvbrdf_fitting.inference.nuisances import CommonErrors
     from tvbrdf_fitting.observations import Observations
     from tvbrdf_fitting.published import PublishedSample, PublishedScan
-    from tvbrdf_fitting.published_database import StoredScan
+    from tvbrdf_fitting.published.database import StoredScan
     from tvbrdf_fitting.result import FitResult
     from tvbrdf_rendering.fit_report import DataSource, FittedSample, FittedScan
 
@@ -54,7 +54,7 @@ class Target:
 
     def path_of(self, scan: int) -> Path:
         """Where a scan is, for messages."""
-        from tvbrdf_fitting.published_scan import DATA_FOLDER, scan_file_name
+        from tvbrdf_fitting.published.scan import DATA_FOLDER, scan_file_name
 
         folder = self.folder if self.file is not None else self.folder / DATA_FOLDER
         return folder / scan_file_name(scan, 1).replace("camera1", "camera*")
@@ -62,7 +62,7 @@ class Target:
 
 def find_targets(path: Path, scan: int | None) -> list[Target]:
     """Return the samples that a path means; raise :class:`RunError` if it means none."""
-    from tvbrdf_fitting.published_scan import DATA_FOLDER, parse_scan_file_name
+    from tvbrdf_fitting.published.scan import DATA_FOLDER, parse_scan_file_name
 
     from ..errors import RunError
 
@@ -92,7 +92,7 @@ def find_targets(path: Path, scan: int | None) -> list[Target]:
 
 def _samples_below(folder: Path) -> list[Path]:
     from tvbrdf_fitting.published import list_samples
-    from tvbrdf_fitting.published_scan import DATA_FOLDER
+    from tvbrdf_fitting.published.scan import DATA_FOLDER
 
     numbered = list_samples(folder)
     others = sorted(path for path in folder.iterdir() if path not in numbered)
@@ -158,7 +158,7 @@ def fit_sample(target: Target, request: Request) -> FittedSample:
 
 def _data_errors() -> tuple[type[Exception], ...]:
     from tvbrdf_fitting.published import PublishedFormatError
-    from tvbrdf_fitting.published_database import DatabaseError
+    from tvbrdf_fitting.published.database import DatabaseError
 
     return PublishedFormatError, DatabaseError
 
@@ -193,7 +193,7 @@ def _stored_scans(
     target: Target, request: Request
 ) -> tuple[dict[int, StoredScan], tuple[str, ...]]:
     """Scans of which the database around the sample has kept the frames, and what is amiss."""
-    from tvbrdf_fitting.published_database import (
+    from tvbrdf_fitting.published.database import (
         CATALOGUE_FILE,
         OBSERVATIONS_FOLDER,
         DatabaseError,
@@ -218,9 +218,9 @@ def _read(
     target: Target, number: int, sample: PublishedSample | None, stored: StoredScan | None
 ) -> _Read:
     from tvbrdf_fitting.published import read_scan
-    from tvbrdf_fitting.published_checks import check_cameras, check_scan
-    from tvbrdf_fitting.published_database import DatabaseError
-    from tvbrdf_fitting.published_observations import stored_observations
+    from tvbrdf_fitting.published.checks import check_cameras, check_scan
+    from tvbrdf_fitting.published.database import DatabaseError
+    from tvbrdf_fitting.published.observations import stored_observations
 
     published = read_scan(target.file or target.folder, number)
     grid = published.observations(None if sample is None else sample.calibration)
@@ -240,7 +240,7 @@ def _suspicions(
     target: Target, sample: PublishedSample | None, read: Mapping[int, _Read]
 ) -> tuple[str, ...]:
     """What is suspicious in the sample as a whole."""
-    from tvbrdf_fitting.published_checks import (
+    from tvbrdf_fitting.published.checks import (
         check_files,
         check_name,
         check_parameters,
@@ -304,7 +304,7 @@ def _load_solver(observations: Observations, request: Request) -> None:
 
 def _choices(read: Sequence[_Read], request: Request) -> Sequence[ModelChoice]:
     """Choose a model for one scan, or one for all; all have the calibration of the first."""
-    from tvbrdf_fitting.model_choice import choose_for_series, choose_model
+    from tvbrdf_fitting.choice.choose import choose_for_series, choose_model
 
     options = {**request.options, "common_errors": read[0].common}
     if len(read) == 1:

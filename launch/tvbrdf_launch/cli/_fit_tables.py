@@ -10,8 +10,8 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from tvbrdf_fitting.choice.choose import ModelChoice, Rung
     from tvbrdf_fitting.error_measures import ErrorMeasures
-    from tvbrdf_fitting.model_choice import ModelChoice, Rung
     from tvbrdf_fitting.result import FitResult
     from tvbrdf_rendering.fit_report import FittedSample, FittedScan, Trend
 

@@ -134,9 +134,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _request(arguments: argparse.Namespace) -> Request:
     """Return what is asked for, or raise :class:`RunError` before anything is read."""
-    from tvbrdf_fitting.losses import LOSSES
     from tvbrdf_fitting.metrics import METRICS
-    from tvbrdf_fitting.solvers import SOLVERS
+    from tvbrdf_fitting.solve.losses import LOSSES
+    from tvbrdf_fitting.solve.solvers import SOLVERS
 
     from ..errors import RunError, did_you_mean
     from ._fit_samples import AUTO, Request

@@ -20,7 +20,7 @@ from ._common import (
 )
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.calibration import CameraCalibration
+    from tvbrdf_fitting.measurement.calibration import CameraCalibration
     from tvbrdf_messages.bus.watcher import Watcher
     from tvbrdf_messages.messages import Frame
     from tvbrdf_messages.run_directory import Graph
@@ -118,7 +118,7 @@ def _exposures(graph: Graph) -> int:
 
 def _calibrations(graph: Graph) -> dict[str, CameraCalibration]:
     """Return the calibration of each camera of the run's merger; none where it has none."""
-    from tvbrdf_fitting.calibration import load_calibration
+    from tvbrdf_fitting.measurement.calibration import load_calibration
     from tvbrdf_nodes.core.loading import load_class
     from tvbrdf_nodes.core.parameters import build
 

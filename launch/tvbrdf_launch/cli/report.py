@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not database.is_dir():
         raise RunError(f"no database {database}: not a folder")
     out = arguments.out or database.resolve().parent
-    from tvbrdf_fitting.published_database import DatabaseError
+    from tvbrdf_fitting.published.database import DatabaseError
     from tvbrdf_rendering import make_report
 
     try:

@@ -2,8 +2,8 @@
 
 linear dn = black level + radiance · exposure · dn_per_radiance_ms · gain error. Shot noise has the
 variance of the electrons, read noise is added, and the response maps linear dn to codes
-(:mod:`tvbrdf_fitting.response`). An image has up to two bands of rows: the sample's above, the
-grey reference piece's in the lowest eighth of the sensor.
+(`tvbrdf_fitting.measurement.response`). An image has up to two bands of rows: the sample's above,
+the grey reference piece's in the lowest eighth of the sensor.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tvbrdf_fitting.response import Response, largest_code
+from tvbrdf_fitting.measurement.response import Response, largest_code
 
 from ..world.scene import CameraEffects
 from .driver import Region

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from tvbrdf_fitting.published_database import DatabaseError
+from tvbrdf_fitting.published.database import DatabaseError
 
 from .catalogue import ErrorMeasure, Fit, Note, Parameter, Scan, StoredFile
 from .records import FileContent, FitRecord, ScanRecord, plain

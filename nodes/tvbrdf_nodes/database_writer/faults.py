@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tvbrdf_fitting.published_database import CATALOGUE_FILE, DatabaseError, DiskFullError
+from tvbrdf_fitting.published.database import CATALOGUE_FILE, DatabaseError, DiskFullError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}

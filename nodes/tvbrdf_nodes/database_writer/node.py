@@ -19,7 +19,7 @@ from ..core.device import DeviceError
 from ..core.node import Node, NodeContext, Outputs, Send, TopicUse
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.published_scan import CameraScan
+    from tvbrdf_fitting.published.scan import CameraScan
 
     from .records import FitRecord, ScanRecord
     from .store import DatabaseStore, Outcome
@@ -71,7 +71,7 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
 
     def prepare(self) -> None:
         """Open the database; one that can't be used ends the run before anything moves."""
-        from tvbrdf_fitting.published_database import DatabaseError
+        from tvbrdf_fitting.published.database import DatabaseError
 
         from .store import DatabaseStore
 
@@ -112,7 +112,7 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
 
     def _work(self) -> Outputs:
         """Store what can be stored, radiance first; keep the rest."""
-        from tvbrdf_fitting.published_database import DatabaseError, DiskFullError
+        from tvbrdf_fitting.published.database import DatabaseError, DiskFullError
 
         waiting, self._waiting = self._waiting, []
         for envelope in sorted(waiting, key=lambda e: not isinstance(e.message, Radiance)):
@@ -237,7 +237,7 @@ def scan_record(radiance: Radiance) -> ScanRecord:
 def _grid(radiance: Radiance) -> dict[int, CameraScan]:
     """Return each camera's radiance on the grid, without what is not valid."""
     from tvbrdf_fitting.geometry import light_direction
-    from tvbrdf_fitting.published_scan import CameraScan
+    from tvbrdf_fitting.published.scan import CameraScan
 
     grid: dict[int, CameraScan] = {}
     for index in range(radiance.grid_radiance.shape[0]):

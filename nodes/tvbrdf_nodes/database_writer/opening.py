@@ -13,8 +13,8 @@ from sqlalchemy.engine import Engine
 from sqlalchemy.orm import Session
 
 from tvbrdf_fitting.published import PublishedFormatError, SampleInfo, format_info
-from tvbrdf_fitting.published_database import CATALOGUE_FILE, SCHEMA_VERSION, DatabaseError
-from tvbrdf_fitting.published_text import sync_folder
+from tvbrdf_fitting.published.database import CATALOGUE_FILE, SCHEMA_VERSION, DatabaseError
+from tvbrdf_fitting.published.text import sync_folder
 
 from .catalogue import Base, Note, Sample, Scan, SchemaVersion, open_engine
 

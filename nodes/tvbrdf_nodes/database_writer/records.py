@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tvbrdf_fitting.published import CameraScan, format_scan_file, scan_file_name
-from tvbrdf_fitting.published_database import (
+from tvbrdf_fitting.published.database import (
     OBSERVATIONS_FOLDER,
     DatabaseError,
     observations_file_name,
 )
-from tvbrdf_fitting.published_scan import DATA_FOLDER
+from tvbrdf_fitting.published.scan import DATA_FOLDER
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,7 +7,7 @@ finishes the renaming. ``brdf-params.txt`` and ``tvBrdf-info.txt`` are derived f
 and written again, whole, whenever it changes.
 
 Layout: ``catalogue.sqlite``, ``catalogue.lock`` and ``sample01/`` (see
-:mod:`tvbrdf_fitting.published_database`). A store is used from one thread.
+:mod:`tvbrdf_fitting.published.database`). A store is used from one thread.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
-from tvbrdf_fitting.published_database import (
+from tvbrdf_fitting.published.database import (
     DatabaseError,
     DiskFullError,
     StoredDatabase,
     read_database,
     sample_folder_name,
 )
-from tvbrdf_fitting.published_text import sync_folder, write_beside
+from tvbrdf_fitting.published.text import sync_folder, write_beside
 
 from .faults import explained
 from .records import (

@@ -19,11 +19,11 @@ from tvbrdf_fitting.published import (
     format_parameters,
     parameters_row,
 )
-from tvbrdf_fitting.published_database import OBSERVATIONS_FOLDER, DatabaseError
-from tvbrdf_fitting.published_info import INFO_FILE
-from tvbrdf_fitting.published_sample import FITS_FILE, LOST_FILE
-from tvbrdf_fitting.published_scan import DATA_FOLDER
-from tvbrdf_fitting.published_text import (
+from tvbrdf_fitting.published.database import OBSERVATIONS_FOLDER, DatabaseError
+from tvbrdf_fitting.published.info import INFO_FILE
+from tvbrdf_fitting.published.sample import FITS_FILE, LOST_FILE
+from tvbrdf_fitting.published.scan import DATA_FOLDER
+from tvbrdf_fitting.published.text import (
     TEMPORARY_PREFIX,
     sync_folder,
     temporary_path,

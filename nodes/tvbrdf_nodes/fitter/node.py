@@ -13,7 +13,7 @@ from ..core.device import DeviceError
 from ..core.node import Node, Outputs, Release, Send, TopicUse
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.nuisances import CommonErrors
+    from tvbrdf_fitting.inference.nuisances import CommonErrors
     from tvbrdf_fitting.observations import Observations
     from tvbrdf_fitting.result import FitResult
 
@@ -58,9 +58,9 @@ class FitterNode(Node[FitterParameters]):
 
     def prepare(self) -> None:
         """Load the solver, and refuse an unknown model or fixed parameter before anything moves."""
-        from tvbrdf_fitting import separable
         from tvbrdf_fitting.fit import LOSSES, METRICS, SOLVERS  # takes most of a second
         from tvbrdf_fitting.models import get_model
+        from tvbrdf_fitting.solve import separable
 
         given = self.parameters
         for name, known in (("method", SOLVERS), ("metric", METRICS), ("loss", LOSSES)):
@@ -71,7 +71,7 @@ class FitterNode(Node[FitterParameters]):
         separable.compile_all()
         self._kept: dict[str, str] = {}
         if given.model == AUTO:
-            import tvbrdf_fitting.model_choice  # noqa: F401
+            import tvbrdf_fitting.choice.choose  # noqa: F401
 
             return
         try:
@@ -91,7 +91,7 @@ class FitterNode(Node[FitterParameters]):
             yield Release("/scan/parameters", str(message.scan))
 
     def _fit(self, radiance: Radiance) -> Parameters:
-        from tvbrdf_fitting.nuisances import CommonErrors
+        from tvbrdf_fitting.inference.nuisances import CommonErrors
         from tvbrdf_fitting.problem import FitError
 
         common = CommonErrors(
@@ -123,7 +123,7 @@ class FitterNode(Node[FitterParameters]):
 
     def _chosen(self, radiance: Radiance, common: CommonErrors) -> Parameters:
         """Choose a model; the one of the sample's scan before stays unless evidence is clear."""
-        from tvbrdf_fitting.model_choice import choose_model
+        from tvbrdf_fitting.choice.choose import choose_model
 
         given = self.parameters
         choice = choose_model(

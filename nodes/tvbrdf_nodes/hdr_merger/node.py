@@ -28,9 +28,13 @@ from .sweep import (
 )
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.calibration import Calibration
-    from tvbrdf_fitting.frame_reduction import FrameReducer
-    from tvbrdf_fitting.scan_merge import FrameRecord, ScanObservations, SweepObservations
+    from tvbrdf_fitting.measurement.calibration import Calibration
+    from tvbrdf_fitting.measurement.frame_reduction import FrameReducer
+    from tvbrdf_fitting.measurement.scan_merge import (
+        FrameRecord,
+        ScanObservations,
+        SweepObservations,
+    )
 
 KEPT_STATES = 20_000
 """Of the arm since its last sweep: those of a sweep of six minutes."""
@@ -97,9 +101,9 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         """Read the calibration and make the tables that frames are reduced with."""
         import cv2
 
-        import tvbrdf_fitting.light_grid  # noqa: F401 - loaded now rather than in the first scan
-        from tvbrdf_fitting.calibration import CalibrationError, load_calibration
-        from tvbrdf_fitting.frame_reduction import FrameReducer
+        import tvbrdf_fitting.measurement.light_grid  # noqa: F401 - loaded now rather than in the first scan
+        from tvbrdf_fitting.measurement.calibration import CalibrationError, load_calibration
+        from tvbrdf_fitting.measurement.frame_reduction import FrameReducer
 
         cv2.setNumThreads(1)
         try:
@@ -154,7 +158,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             return
         self._frames += 1
         if frame.kind == "dark":
-            from tvbrdf_fitting.scan_merge import FrameRecord
+            from tvbrdf_fitting.measurement.scan_merge import FrameRecord
 
             record = FrameRecord(
                 number, -1, frame.exposure_ms, header.stamp_ns, statistics, lamp_on=False
@@ -243,8 +247,8 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         return [record for _, record in found]
 
     def _publish(self, command: ScanCommand) -> Outputs:
-        from tvbrdf_fitting.light_grid import merge_on_grid
-        from tvbrdf_fitting.scan_merge import assemble_scan
+        from tvbrdf_fitting.measurement.light_grid import merge_on_grid
+        from tvbrdf_fitting.measurement.scan_merge import assemble_scan
 
         calibration = self._calibrated()
         done = self._done[command.scan]

@@ -10,9 +10,9 @@ from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import ArmState, SweepResult
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.calibration import Calibration
-    from tvbrdf_fitting.frame_reduction import PatchStatistics
-    from tvbrdf_fitting.scan_merge import FrameRecord, SweepObservations
+    from tvbrdf_fitting.measurement.calibration import Calibration
+    from tvbrdf_fitting.measurement.frame_reduction import PatchStatistics
+    from tvbrdf_fitting.measurement.scan_merge import FrameRecord, SweepObservations
 
 SweepKey = tuple[int, int, int]
 """Scan, sweep, attempt."""
@@ -72,8 +72,8 @@ def split_states(
 
 def solve_arm(states: list[Envelope], result: SweepResult) -> tuple[Any, float, dict[str, float]]:
     """Return the light's path in a sweep, the deviation of its stamps (ns), and its clock."""
-    from tvbrdf_fitting.clock_model import ClockError, fit_clock
-    from tvbrdf_fitting.light_path import LightPath
+    from tvbrdf_fitting.measurement.clock_model import ClockError, fit_clock
+    from tvbrdf_fitting.measurement.light_path import LightPath
 
     if len(states) != result.last_sequence - result.first_sequence + 1:
         raise SweepError(f"{result.source}: states of the sweep are missing")
@@ -111,9 +111,9 @@ def solve_sweep(
     correct_motion_blur: bool = True,
 ) -> tuple[SweepObservations, dict[str, Any]]:
     """Return a sweep's calibrated observations, and what was found about its clocks."""
-    from tvbrdf_fitting.clock_model import ClockError, frame_stamps
-    from tvbrdf_fitting.motion_blur import without_motion_blur
-    from tvbrdf_fitting.scan_merge import FrameRecord, sweep_observations
+    from tvbrdf_fitting.measurement.clock_model import ClockError, frame_stamps
+    from tvbrdf_fitting.measurement.motion_blur import without_motion_blur
+    from tvbrdf_fitting.measurement.scan_merge import FrameRecord, sweep_observations
 
     path, arm_std_ns, arm_facts = solve_arm(states, sweep.results[arm])
     records: list[FrameRecord] = []

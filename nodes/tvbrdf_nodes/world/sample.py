@@ -234,7 +234,7 @@ class MeasuredSample:
 
     def __init__(self, path: str | Path) -> None:
         from tvbrdf_fitting.published import PublishedFormatError, list_scans, read_calibration
-        from tvbrdf_fitting.published_sample import CALIBRATION_FILE
+        from tvbrdf_fitting.published.sample import CALIBRATION_FILE
 
         self._folder = Path(path)
         try:
@@ -265,7 +265,7 @@ class MeasuredSample:
 
     def _read(self, number: int, camera: int) -> PPoly:
         from tvbrdf_fitting.published import PublishedFormatError, read_scan_file, scan_file_name
-        from tvbrdf_fitting.published_scan import DATA_FOLDER
+        from tvbrdf_fitting.published.scan import DATA_FOLDER
 
         path = self._folder / DATA_FOLDER / scan_file_name(number, camera)
         try:

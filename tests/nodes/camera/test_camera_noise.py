@@ -175,7 +175,7 @@ def test_dark_pixels_do_not_wrap_round() -> None:
 
 def test_gamma_response_is_undone_by_its_inverse() -> None:
     """Noise is added to the light, before the response: linearised codes have the linear mean."""
-    from tvbrdf_fitting.response import Response
+    from tvbrdf_fitting.measurement.response import Response
 
     camera, bands = maker(response="gamma", bit_depth=16), full_bands()
     signal_dn = camera.signal_dn(np.full((2, 3), 0.7), 4.0)

@@ -10,7 +10,7 @@ import yaml
 
 from tvbrdf_fitting.models import get_model
 from tvbrdf_fitting.published import read_sample
-from tvbrdf_fitting.published_database import read_database
+from tvbrdf_fitting.published.database import read_database
 from tvbrdf_nodes.world.sample import make_sample
 from tvbrdf_nodes.world.scene import load_scene
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import binomtest, norm
 
 from tvbrdf_fitting.geometry import light_world_angle_deg
-from tvbrdf_fitting.published_scan import CameraScan, read_scan
+from tvbrdf_fitting.published.scan import CameraScan, read_scan
 
 if TYPE_CHECKING:
     from conftest import MakeSample, RunRig

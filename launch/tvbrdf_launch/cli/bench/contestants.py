@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.problem import Problem
-from tvbrdf_fitting.solvers import SOLVERS
+from tvbrdf_fitting.solve.solvers import SOLVERS
 
 Solve = Callable[[Problem], FloatArray]
 """From a problem to internal coordinates (p,)."""

@@ -19,8 +19,8 @@ from tvbrdf_fitting.geometry import FloatArray, light_world_angle_deg
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.problem import make_problem
-from tvbrdf_fitting.separable import compile_all
-from tvbrdf_fitting.solvers import SOLVERS
+from tvbrdf_fitting.solve.separable import compile_all
+from tvbrdf_fitting.solve.solvers import SOLVERS
 
 from .contestants import CONTESTANTS, Contestant
 from .hemisphere import Hemisphere

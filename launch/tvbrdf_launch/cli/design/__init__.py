@@ -11,8 +11,8 @@ from .._common import Subparsers, add_json_option, add_verb, count, print_json
 from ._asked import integer_list, not_negative, number_list, part_of_one, word_list
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.design import DesignStudy
-    from tvbrdf_fitting.design_simulation import Trial
+    from tvbrdf_fitting.design.search import DesignStudy
+    from tvbrdf_fitting.design.simulation import Trial
 
 EPILOG = """\
 The material is a sample (tvbrdf samples), a sample's .yaml file, tvbrdf fit's .json, or a model
@@ -113,9 +113,9 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the verb."""
-    from tvbrdf_fitting.design import find_designs
-    from tvbrdf_fitting.design_simulation import confirm
-    from tvbrdf_fitting.nuisances import CommonErrors
+    from tvbrdf_fitting.design.search import find_designs
+    from tvbrdf_fitting.design.simulation import confirm
+    from tvbrdf_fitting.inference.nuisances import CommonErrors
 
     from ...errors import RunError
     from ._asked import accuracy_of, find_material, names_of, rig_of

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.design import Accuracy
-    from tvbrdf_fitting.fisher_information import Rig
+    from tvbrdf_fitting.design.fisher_information import Rig
+    from tvbrdf_fitting.design.search import Accuracy
     from tvbrdf_fitting.models import ReflectanceModel
 
 
@@ -116,7 +116,7 @@ def rig_of(arguments: argparse.Namespace) -> Rig:
     """Return the paper's rig with what was said of it."""
     from dataclasses import fields
 
-    from tvbrdf_fitting.fisher_information import NoiseModel, Rig
+    from tvbrdf_fitting.design.fisher_information import NoiseModel, Rig
 
     from ...errors import RunError, did_you_mean
 
@@ -141,7 +141,7 @@ def rig_of(arguments: argparse.Namespace) -> Rig:
 
 def accuracy_of(model: ReflectanceModel, words: Sequence[str]) -> dict[str, Accuracy]:
     """Return what ``NAME=VALUE`` words want: a number, a part as 5%, or any."""
-    from tvbrdf_fitting.design import Accuracy
+    from tvbrdf_fitting.design.search import Accuracy
 
     from ...errors import RunError
 

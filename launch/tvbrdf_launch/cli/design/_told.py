@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from .._common import print_table
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.design import Design, DesignStudy
-    from tvbrdf_fitting.design_simulation import Trial
+    from tvbrdf_fitting.design.search import Design, DesignStudy
+    from tvbrdf_fitting.design.simulation import Trial
 
 
 def print_study(study: DesignStudy, trials: Sequence[Trial], source: str) -> None:

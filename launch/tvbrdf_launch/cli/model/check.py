@@ -9,7 +9,7 @@ from .._common import Subparsers, add_json_option, add_verb, print_json, print_t
 from ._models import find_model, values_of
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.model_report import AlbedoRow, ModelReport
+    from tvbrdf_fitting.properties.report import AlbedoRow, ModelReport
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -47,7 +47,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the verb."""
-    from tvbrdf_fitting.model_report import ANGLES_DEG, check_model
+    from tvbrdf_fitting.properties.report import ANGLES_DEG, check_model
 
     from ...errors import RunError
 

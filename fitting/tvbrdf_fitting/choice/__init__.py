@@ -1,0 +1,1 @@
+"""The simplest model that explains a scan."""

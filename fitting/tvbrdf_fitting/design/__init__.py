@@ -1,0 +1,1 @@
+"""The fewest lights, cameras and exposures for a wanted accuracy."""

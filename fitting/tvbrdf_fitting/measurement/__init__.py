@@ -1,0 +1,1 @@
+"""From frames to radiance: calibration, where the light was, merging of exposures."""

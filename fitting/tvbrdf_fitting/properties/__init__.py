@@ -1,0 +1,1 @@
+"""Properties of a model: reciprocity, albedos, where it creates energy."""

@@ -1,0 +1,13 @@
+"""``python -m tvbrdf_fitting.solve.separable``: compile it, so that no later fit waits.
+
+The compiled code is kept beside the sources, or where NUMBA_CACHE_DIR says.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from . import compile_all
+
+if __name__ == "__main__":
+    sys.stderr.write(f"compiled the separable solver in {compile_all():.1f} s\n")
