@@ -90,32 +90,25 @@ def fit_parameters(
         raise ValueError(
             f"variance has shape {spread.shape}, expected {(n, 3)} or {measured.shape}"
         )
+    # a channel or row that no scan saw is no part of the problem
     seen = np.isfinite(spread) if spread.ndim == 2 else np.isfinite(spread).any(axis=0)
-    bad = ~np.isfinite(measured) & np.isfinite(spread)
-    if bad.any():
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise ValueError(
-            f"radiance{list(where)} is {measured[where]}; give values that can't be used an "
-            f"infinite variance ({int(bad.sum())} such values)"
-        )
     problem = make_problem(_frame(lights, views, seen), chosen, fixed or {}, {})
     rows = np.flatnonzero((seen & (above_horizon(lights) & above_horizon(views))[:, None]).any(1))
-    whole = seen[rows].T
-    targets = np.ascontiguousarray(measured[:, rows].transpose(0, 2, 1))
-    targets[~np.isfinite(targets)] = 0.0
-    weights = 1 / np.sqrt(np.swapaxes(spread[..., rows, :], -1, -2))
-    weights = np.ascontiguousarray(np.where(whole, weights, 0.0))
-    count = max(1, min(jobs, len(targets)))
-    chunks = np.array_split(np.arange(len(targets)), count)
+    count = max(1, min(jobs, len(measured)))
+    chunks = [slice(c[0], c[-1] + 1) for c in np.array_split(np.arange(len(measured)), count)]
+    fast = method == "separable" and separable.fits(problem)
 
-    def work(chunk: IntArray) -> tuple[FloatArray, FloatArray, IntArray, BoolArray]:
-        own = weights if weights.ndim == 2 else weights[chunk]
-        if method == "separable" and separable.fits(problem):
-            return separable.solve_many(problem, targets[chunk], own)
-        return _solve_each(problem, targets[chunk], own, method)
+    def work(chunk: slice) -> tuple[FloatArray, FloatArray, IntArray, BoolArray]:
+        own = spread if spread.ndim == 2 else spread[chunk]
+        if fast:
+            return separable.solve_many(problem, measured[chunk], own, rows)
+        return _solve_each(problem, measured[chunk], own, rows, method)
 
     with ThreadPoolExecutor(count) as pool:
-        parts = list(pool.map(work, chunks))
+        try:
+            parts = list(pool.map(work, chunks))
+        except ValueError as error:
+            raise _unusable(measured, spread) or error from error
     internal, costs, evaluations, converged = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
@@ -153,13 +146,31 @@ def _frame(lights: FloatArray, views: FloatArray, seen: BoolArray) -> Observatio
     )
 
 
+def _unusable(measured: FloatArray, spread: FloatArray) -> ValueError | None:
+    """Return what says which value, if any, can't be used."""
+    if not (spread > 0).all():
+        where = tuple(int(i) for i in np.argwhere(~(spread > 0))[0])
+        return ValueError(f"variance{list(where)} is {spread[where]}; it must be above 0")
+    bad = ~np.isfinite(measured) & np.isfinite(spread)
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        return ValueError(
+            f"radiance{list(where)} is {measured[where]}; give values that can't be used an "
+            f"infinite variance ({int(bad.sum())} such values)"
+        )
+    return None
+
+
 def _solve_each(
-    problem: Problem, targets: FloatArray, weights: FloatArray, method: str
+    problem: Problem, measured: FloatArray, spread: FloatArray, rows: IntArray, method: str
 ) -> tuple[FloatArray, FloatArray, IntArray, BoolArray]:
-    problems = [
-        replace(problem, radiance=y, weight=w)
-        for y, w in zip(targets, np.broadcast_to(weights, targets.shape), strict=True)
-    ]
+    problems = []
+    for values, variance in zip(measured, np.broadcast_to(spread, measured.shape), strict=True):
+        if (fault := _unusable(values, variance)) is not None:
+            raise fault
+        weight = 1 / np.sqrt(variance[rows].T)
+        radiance = np.where(weight > 0, values[rows].T, 0.0)
+        problems.append(replace(problem, radiance=radiance, weight=weight))
     solutions = [SOLVERS[method](each) for each in problems]
     return (
         np.array([s.internal for s in solutions]),

@@ -314,8 +314,13 @@ def _by_covariance(result: FitResult, directions: _Directions, value: FloatArray
         # parameter would matter where the carrier does
         carriers = [model.parameter_names.index(n) for g in parameter.carried_by for n in g]
         unsure = [i for i in carriers if deviations[i] != 0]
-        matters = np.abs(slopes[[index, *unsure]]).max(axis=0) > smallest
-        deviation[matters] = np.inf
+        deviation[np.abs(slopes[[index, *unsure]]).max(axis=0) > smallest] = np.inf
+        if unsure and parameter.grid:  # and it would matter elsewhere with another value
+            for other in parameter.grid:
+                internal = result.internal_values.copy()
+                internal[index] = other
+                reach = np.abs(directions.slopes(internal)[unsure]).max(axis=0)
+                deviation[reach > smallest] = np.inf
     return np.asarray(deviation)
 
 

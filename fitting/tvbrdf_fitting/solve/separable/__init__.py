@@ -16,7 +16,7 @@ import numpy as np
 
 from ...geometry import BoolArray, FloatArray, IntArray
 from ...problem import Problem, Solution
-from .layout import Layout, data_of, layout_of
+from .layout import Layout, data_of, geometry_of, layout_of
 
 TOLERANCE = 1e-9
 """Relative step at which a descent ends; the one after it would be its square."""
@@ -68,43 +68,48 @@ def solve(problem: Problem) -> Solution:
 
 
 def solve_many(
-    problem: Problem, radiances: FloatArray, weights: FloatArray
+    problem: Problem, radiances: FloatArray, variances: FloatArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray, BoolArray]:
-    """Solve scans (m, 3, n) that share a problem's directions; weights are (3, n) or (m, 3, n).
+    """Solve scans (m, n, 3) that share a problem's directions; variances are (n, 3) or (m, n, 3).
+
+    `rows` are those of the n that the problem's directions are.
 
     Returns internal coordinates (m, p), costs (m,), evaluations (m,), and whether each converged.
+
+    Raises
+    ------
+    ValueError
+        Names the first scan with a value that is not finite, or a variance that is not positive.
     """
     layout = layout_of(problem.model)
     if layout is None:
         raise ValueError(f"{problem.model.name} has no separable form")
     forget_stale_code()
-    from .search import EXHAUSTED, solve_alike
-    from .search import solve as search
+    from .many import solve_alike, solve_each
+    from .search import EXHAUSTED
 
     lower, upper = limits(problem, layout)
-    vectors, f, q, _, _ = data_of(problem, layout)
+    geometry = geometry_of(
+        problem.model, layout, problem.prepared, problem.to_radiance * (1 / np.pi)
+    )
     xs = np.zeros((len(radiances), len(lower)))
     costs, counts = np.zeros(len(radiances)), np.zeros((len(radiances), 3), dtype=np.int64)
-    if weights.ndim == 2:
-        solve_alike(
-            xs,
-            layout.form,
-            vectors,
-            f,
-            q,
-            radiances,
-            weights,
-            lower,
-            upper,
-            TOLERANCE,
-            costs,
-            counts,
-        )
-    else:
-        for m, (radiance, weight) in enumerate(zip(radiances, weights, strict=True)):
-            data = (vectors, f, q, radiance, weight)
-            found = search(xs[m], layout.form, data, lower, upper, TOLERANCE)
-            costs[m], counts[m] = found[0], found[1:]
+    run = solve_alike if variances.ndim == 2 else solve_each
+    bad = run(
+        xs,
+        layout.form,
+        geometry,
+        radiances,
+        variances,
+        rows,
+        lower,
+        upper,
+        TOLERANCE,
+        costs,
+        counts,
+    )
+    if bad >= 0:
+        raise ValueError(f"scan {bad} of the batch has a value that can't be used")
     internal = np.tile(problem.values, (len(xs), 1))
     for k, index in enumerate(layout.where):
         if index >= 0:
@@ -140,7 +145,8 @@ def compile_all() -> float:
     """
     began = time.perf_counter()
     forget_stale_code()
-    from .search import refine, solve_alike
+    from .many import solve_alike, solve_each
+    from .search import refine
     from .search import solve as search
 
     ones, form, tolerance = np.ones((3, 8)), np.array([0.33, 0.17]), TOLERANCE
@@ -149,7 +155,10 @@ def compile_all() -> float:
     search(x, form, (ones, f, f, ones, ones), lower, upper, tolerance)
     refine(x, form, (ones, f, f, ones, ones), lower, upper, tolerance)
     xs, costs, counts = np.zeros((1, 6)), np.zeros(1), np.zeros((1, 3), dtype=np.int64)
-    solve_alike(xs, form, ones, f, f, ones[None], ones, lower, upper, tolerance, costs, counts)
+    rows, values = np.arange(8), np.ones((1, 8, 3))
+    for run, variance in ((solve_alike, values[0]), (solve_each, values)):
+        geometry = (ones, f, f)
+        run(xs, form, geometry, values, variance, rows, lower, upper, tolerance, costs, counts)
     return time.perf_counter() - began
 
 

@@ -12,6 +12,8 @@ the lobe's with the vectors, with itself, and with the data. `forms` (3, 9) is o
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -22,7 +24,9 @@ ROUGHNESSES = 6
 """Values of s tried at every width."""
 COLD_ROUNDS, WARM_ROUNDS = 4, 2
 """Gauss-Newton rounds from no amplitude at all, and from nearly the right ones."""
-_REFINEMENTS = 25
+ROUGH, EXACT = 2, 25
+"""Refinements of s, at most: to start a descent from, and to compare widths."""
+_SECANTS = 3
 _DARK = 1e-12
 
 
@@ -93,7 +97,7 @@ def _pull(f, kd, ks):
 
 
 @njit(**JIT)
-def best_at_width(x, form, diffuse, lobes, lower, upper, room):
+def best_at_width(x, form, diffuse, lobes, lower, upper, refinements, room):
     """Write the best s and amplitudes at the width of x; return the cost, less a constant.
 
     Also return an s in another valley of the grid, or -1 where there is none.
@@ -132,7 +136,8 @@ def best_at_width(x, form, diffuse, lobes, lower, upper, room):
         return lowest, elsewhere
     left, right = first + spacing * min(chosen, other), first + spacing * max(chosen, other)
     slope_left, slope_right = slopes[min(chosen, other)], slopes[max(chosen, other)]
-    for _ in range(_REFINEMENTS):
+    side = 0
+    for _ in range(refinements):
         t = (left * slope_right - right * slope_left) / (slope_right - slope_left)
         x[3] = _roughness(t, lower[3], upper[3])
         cost, slope = improve_amplitudes(x, form, diffuse, lobes, lower, upper, WARM_ROUNDS, forms)
@@ -142,14 +147,37 @@ def best_at_width(x, form, diffuse, lobes, lower, upper, room):
             best[:] = x
         if abs(gain) <= 1e-11 * abs(lowest):
             break
+        # an end that stays twice is given half its weight
         if slope < 0:
             left, slope_left = t, slope
-            slope_right *= 0.5
+            if side < 0:
+                slope_right *= 0.5
+            side = -1
         else:
             right, slope_right = t, slope
-            slope_left *= 0.5
+            if side > 0:
+                slope_left *= 0.5
+            side = 1
     x[:] = best
     return lowest, elsewhere
+
+
+@njit(**JIT)
+def settle(x, moved, form, diffuse, lobes, lower, upper, forms):
+    """Improve s and the amplitudes in x after s has moved, by the secant rule for the slope."""
+    _, slope = improve_amplitudes(x, form, diffuse, lobes, lower, upper, WARM_ROUNDS, forms)
+    before, slope_before = x[3], slope
+    x[3] = clip(x[3] - math.copysign(0.2 * abs(moved), slope), lower[3], upper[3])
+    for _ in range(_SECANTS):
+        if x[3] == before:
+            return
+        _, slope = improve_amplitudes(x, form, diffuse, lobes, lower, upper, WARM_ROUNDS, forms)
+        bend = (slope - slope_before) / (x[3] - before)
+        if not bend > 0:
+            return
+        before, slope_before = x[3], slope
+        x[3] = clip(x[3] - slope / bend, lower[3], upper[3])
+    improve_amplitudes(x, form, diffuse, lobes, lower, upper, WARM_ROUNDS, forms)
 
 
 @njit(**JIT)

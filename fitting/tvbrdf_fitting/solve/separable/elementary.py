@@ -58,23 +58,14 @@ def clip(value, lower, upper):
     return min(max(value, lower), upper)
 
 
-@njit(fastmath=SUMS, **JIT)
-def dot(one, other):
-    """Sum of products."""
-    total = 0.0
-    for i in range(one.shape[0]):
-        total += one[i] * other[i]
-    return total
-
-
-@njit(fastmath=SUMS, **JIT)
-def weigh(weight, values, weighted):
-    """Write weight^2 x values; return the sum of squared weighted values."""
-    total = 0.0
-    for i in range(values.shape[0]):
-        weighted[i] = weight[i] * weight[i] * values[i]
-        total += weighted[i] * values[i]
-    return total
+@njit(**JIT)
+def squared(values):
+    """Return the squares of (3, n) values."""
+    out = np.empty(values.shape)
+    for c in range(3):
+        for i in range(values.shape[1]):
+            out[c, i] = values[c, i] * values[c, i]
+    return out
 
 
 @njit(**JIT)

@@ -22,31 +22,40 @@ from numba import njit
 
 from .amplitudes import (
     COLD_ROUNDS,
+    EXACT,
+    ROUGH,
     WARM_ROUNDS,
     best_at_width,
     improve_amplitudes,
     lower_bound,
+    settle,
     triangulate,
 )
-from .elementary import JIT, bounded_step, clip, dot, weigh
-from .equations import (
-    nearest,
-    normal_equations,
-    write_diffuse_products,
-    write_lobe_products,
-    zero_outside,
+from .elementary import JIT, bounded_step, clip, squared
+from .equations import nearest, normal_equations, write_diffuse_products, write_lobe_products
+from .widths import (
+    nearest_seen,
+    seen_amplitudes,
+    shifted,
+    width_between,
+    widths_between,
+    write_sweep,
 )
 
-WIDTHS = 20
-"""Values of u tried; neighbours' widths have a ratio of 1.35."""
 VALLEYS = 6
 MAX_STEPS, SECOND_STEPS = 100, 25
 """Steps at most in the valley that looks deepest, and in others."""
 CONVERGED, STALLED, EXHAUSTED = 0, 1, 2
 _APART = 0.05
 """Relative distance of two values of s that can lie in different valleys."""
-_BEND = 1e-5
-"""Relative step above which amplitudes are made the best again."""
+_BEND, _FAR = 1e-5, 1e-2
+"""Relative steps above which amplitudes, and the roughness, are made the best again."""
+_FAITHFUL, _SHRINKING = 0.3, 1e-3
+"""How well a step must have been foreseen before the next is, and by how much it can shrink."""
+_CLOSER, _NEARLY = 4, 1.05
+"""Parts of a step of the grid where valleys can be narrow, and the ratio of costs that says so."""
+_SAME = 0.1
+"""Distance in u along which no second valley of s opens, away from the bounds."""
 
 
 @njit(**JIT)
@@ -54,6 +63,7 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
     """Newton steps, damped, from x, in place, within bounds; return (cost, evaluations, status).
 
     Where the second derivatives are not positive, the Gauss-Newton matrix stands in for them.
+    `columns` (3, n) is overwritten.
     """
     size = x.shape[0]
     gradient, trial_gradient, step = np.empty(size), np.empty(size), np.empty(size)
@@ -62,8 +72,9 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
     curvature, trial_curvature = np.empty((size, size)), np.empty((size, size))
     factor, products, forms = np.empty((size, size)), np.empty((3, 5)), np.empty((3, 9))
     free, held = np.ones(size, np.bool_), np.ones(size, np.bool_)
-    cost = normal_equations(x, form, data, columns, gradient, matrix, curvature)
+    cost = normal_equations(x, form, data, diffuse, False, columns, gradient, matrix, curvature)
     evaluations, damping, growth, previous, rate = 1, 0.0, 2.0, np.inf, 1.0
+    faithful = False
     for _ in range(steps):
         for i in range(size):
             scale[i] = math.sqrt(matrix[i, i]) if matrix[i, i] > 0 else 1.0
@@ -95,11 +106,31 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
         length, extent = math.sqrt(length), math.sqrt(extent)
         if length <= 1e-15 * extent:
             return cost, evaluations, CONVERGED
-        if length > _BEND * extent:
-            write_lobe_products(trial[size - 1], data, blocks, columns[0], products)
-            improve_amplitudes(trial, form, diffuse, products, lower, upper, WARM_ROUNDS, forms)
+        # undamped steps with true second derivatives square the distance to the bottom: where the
+        # next one would be nothing, this one's end need not be looked at
+        after = max(10 * (length / previous) ** 2, _SHRINKING) * length
+        last = faithful and model is curvature and damping == 0.0 and after <= tolerance * extent
+        if last and predicted * length <= 1e-11 * cost * previous:
+            x[:] = trial
+            return cost - predicted, evaluations, CONVERGED
+        known = length > _BEND * extent
+        if known:
+            scale_u = math.exp(2 * trial[size - 1])
+            write_lobe_products(scale_u, 1, data, blocks, columns[0], products)
+            if length > _FAR * extent:
+                settle(trial, step[3], form, diffuse, products, lower, upper, forms)
+            else:
+                improve_amplitudes(trial, form, diffuse, products, lower, upper, WARM_ROUNDS, forms)
         trial_cost = normal_equations(
-            trial, form, data, columns, trial_gradient, trial_matrix, trial_curvature
+            trial,
+            form,
+            data,
+            diffuse,
+            known,
+            columns,
+            trial_gradient,
+            trial_matrix,
+            trial_curvature,
         )
         evaluations += 1
         reduction = cost - trial_cost
@@ -108,6 +139,7 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
         lost = abs(predicted) <= noise and abs(reduction) <= 16 * noise
         if reduction > 0 or (lost and length < 0.5 * previous):
             ratio = reduction / predicted if predicted > 0 and not lost else 1.0
+            faithful = abs(ratio - 1) < _FAITHFUL
             cost = trial_cost
             x[:] = trial
             gradient[:] = trial_gradient
@@ -122,7 +154,7 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
             rate, before = length / previous if previous < np.inf else 1.0, rate
             shrunk = max(rate, before) * length <= tolerance * extent
             growth, previous = 2.0, length
-            if (shrunk and damping == 0.0) or length <= tolerance * extent:
+            if ((shrunk or last) and damping == 0.0) or length <= tolerance * extent:
                 return cost, evaluations, CONVERGED
         else:
             if lost or length <= tolerance * extent:
@@ -133,69 +165,122 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
 
 
 @njit(**JIT)
-def width_at(k, widths, lower, upper):
-    """Return the k-th value of u of the grid."""
-    low, high = lower[lower.shape[0] - 1], upper[upper.shape[0] - 1]
-    return low + (high - low) * k / (widths - 1) if widths > 1 else low
+def find_bottoms(
+    best, form, data, blocks, diffuse, triangles, us, floors, lobes, energy, lower, upper, falloff
+):
+    """Return the best points (k, 6) or (k, 8) at suspicious widths, in order, and their costs (k,).
+
+    Only widths whose bound lies below what was found can hide a deeper valley. Where such a width's
+    own cost is far above it, a valley can be narrower than the grid: it is looked for in between.
+    Costs of what is no local minimum are inf.
+    """
+    size, widths = lower.shape[0], us.shape[0]
+    count = (widths - 1) * _CLOSER + 1
+    costs, bottoms, points = np.full(count, np.inf), np.full(count, np.inf), np.empty((count, size))
+    products, room = np.empty((3, 5)), np.empty((6, 9))
+    margin = 1e-9 * best + 1e-10 * energy
+    coloured = size == 8
+    for turn in range(_CLOSER):  # the grid, then what lies between
+        for k in range(turn, count, _CLOSER):
+            node, u = k // _CLOSER, us[k // _CLOSER]
+            if turn == 0:
+                suspicious = floors[node] < best + margin
+                products[:, :] = lobes[node]
+            else:
+                suspicious = floors[node] < best + margin or floors[node + 1] < best + margin
+                ends = costs[node * _CLOSER], costs[(node + 1) * _CLOSER]
+                if not suspicious or max(ends[0], ends[1]) < _NEARLY * best:
+                    continue
+                u += (us[node + 1] - u) * turn / _CLOSER
+                write_lobe_products(math.exp(2 * u), 1, data, blocks, falloff, products)
+                floor = 0.5 * energy + lower_bound(triangles, products, coloured)
+                suspicious = floor < best + margin
+            if suspicious:
+                for i in range(size):
+                    points[k, i] = clip(0.0, lower[i], upper[i])
+                points[k, size - 1] = u
+                cost, _ = best_at_width(
+                    points[k], form, diffuse, products, lower, upper, EXACT, room
+                )
+                costs[k] = cost + 0.5 * energy
+    before = np.inf
+    for k in range(count):
+        if costs[k] == np.inf and k % _CLOSER:
+            continue  # was not looked at: no neighbour
+        j = k + 1
+        while j < count and costs[j] == np.inf and j % _CLOSER:
+            j += 1
+        # of a plateau its last point
+        if costs[k] <= before and (j >= count or costs[k] < costs[j]):
+            bottoms[k] = costs[k]
+        before = costs[k]
+    return points, bottoms
 
 
 @njit(**JIT)
-def width_count(lower, upper):
-    """Return how many values of u are tried: one where it is fixed."""
-    last = lower.shape[0] - 1
-    return WIDTHS if upper[last] > lower[last] else 1
-
-
-@njit(**JIT)
-def search(x, form, data, blocks, diffuse, lobes, energy, lower, upper, columns, tolerance):
+def search(x, form, data, blocks, diffuse, us, lobes, energy, lower, upper, columns, tolerance):
     """Descend every valley that could hold the optimum, given all products; see `solve`."""
-    size, widths = x.shape[0], lobes.shape[0]
+    size, widths = x.shape[0], us.shape[0]
     triangles, products, room = np.empty((3, 9)), np.empty((3, 5)), np.empty((6, 9))
-    costs, floors, points = np.full(widths, np.inf), np.empty(widths), np.empty((widths, size))
+    floors, start, falloff = np.empty(widths), np.empty(size), columns[0]
     triangulate(diffuse, triangles)
     for k in range(widths):
         floors[k] = 0.5 * energy + lower_bound(triangles, lobes[k], size == 8)
-        for i in range(size):
-            points[k, i] = clip(0.0, lower[i], upper[i])
-        points[k, size - 1] = width_at(k, widths, lower, upper)
-
     first = int(np.argmin(floors))
-    costs[first], _ = best_at_width(points[first], form, diffuse, lobes[first], lower, upper, room)
-    x[:] = points[first]
+    for i in range(size):
+        x[i] = clip(0.0, lower[i], upper[i])
+    x[size - 1] = began = width_between(us, floors, first)
+    write_lobe_products(math.exp(2 * began), 1, data, blocks, falloff, products)
+    _, elsewhere = best_at_width(x, form, diffuse, products, lower, upper, ROUGH, room)
     best, evaluations, status = descend(
         x, form, data, blocks, diffuse, lower, upper, columns, tolerance, MAX_STEPS
     )
     valleys = 1
-    # only widths whose bound lies below what was found can hide a deeper valley
-    margin = 1e-9 * best + 1e-13 * energy
-    for k in range(widths):
-        if k != first and floors[k] < best + margin:
-            costs[k], _ = best_at_width(points[k], form, diffuse, lobes[k], lower, upper, room)
-    bottoms = np.full(widths, np.inf)  # of a plateau its last point
-    for k in range(widths):
-        if (k == 0 or costs[k] <= costs[k - 1]) and (k == widths - 1 or costs[k] < costs[k + 1]):
-            bottoms[k] = costs[k]
-    bottoms[first] = np.inf
-    start = np.empty(size)
-    for _ in range(VALLEYS - 1):
-        chosen = int(np.argmin(bottoms))
-        if bottoms[chosen] == np.inf:
-            break
-        bottoms[chosen] = np.inf
-        start[:] = points[chosen]
-        # a valley is nearly as deep at its best grid point as at its bottom
-        cost, spent, state = descend(
-            start, form, data, blocks, diffuse, lower, upper, columns, tolerance, SECOND_STEPS
+    if np.min(floors) < best * (1 + 1e-9) + 1e-10 * energy:
+        points, bottoms = find_bottoms(
+            best,
+            form,
+            data,
+            blocks,
+            diffuse,
+            triangles,
+            us,
+            floors,
+            lobes,
+            energy,
+            lower,
+            upper,
+            falloff,
         )
-        valleys += 1
-        evaluations += spent
-        if cost < best:
-            best, status = cost, state
-            x[:] = start
+        at = x[size - 1]
+        for _ in range(VALLEYS - 1):
+            chosen = int(np.argmin(bottoms))
+            if bottoms[chosen] == np.inf:
+                break
+            # the nearest point of the valley that was descended is no other valley
+            if bottoms[chosen] >= best and abs(points[chosen, size - 1] - at) < _SAME:
+                bottoms[chosen] = np.inf
+                continue
+            bottoms[chosen] = np.inf
+            start[:] = points[chosen]
+            # a valley is nearly as deep at its best grid point as at its bottom
+            cost, spent, state = descend(
+                start, form, data, blocks, diffuse, lower, upper, columns, tolerance, SECOND_STEPS
+            )
+            valleys += 1
+            evaluations += spent
+            if cost < best:
+                best, status = cost, state
+                x[:] = start
+    inside = True
+    for i in range(4):
+        inside &= lower[i] < x[i] < upper[i]
+    if inside and valleys == 1 and elsewhere < 0 and abs(x[size - 1] - began) < _SAME:
+        return best, evaluations, status, valleys
     # dark surfaces can have two valleys of s at one width
     start[:] = x
-    write_lobe_products(x[size - 1], data, blocks, columns[0], products)
-    _, elsewhere = best_at_width(start, form, diffuse, products, lower, upper, room)
+    write_lobe_products(math.exp(2 * x[size - 1]), 1, data, blocks, falloff, products)
+    _, elsewhere = best_at_width(start, form, diffuse, products, lower, upper, EXACT, room)
     other = abs(start[3] - x[3]) > _APART * (0.1 + x[3])
     if not other and elsewhere >= 0:
         other = True
@@ -214,7 +299,7 @@ def search(x, form, data, blocks, diffuse, lobes, energy, lower, upper, columns,
 
 
 @njit(**JIT)
-def solve(x, form, data, lower, upper, tolerance):
+def solve(x, form, scan, lower, upper, tolerance):
     """Find the global optimum within the bounds and write it into x.
 
     Parameters
@@ -223,7 +308,7 @@ def solve(x, form, data, lower, upper, tolerance):
         (6,) or (8,) coordinates, written.
     form
         (2,) constant of C1 and factor of E: (0.33, 0.17) for the full Oren-Nayar model.
-    data
+    scan
         vectors (3, n): c, g1 c, g2 c; f (n,): pi c times the lobe's geometric factor; q (n,):
         theta_h squared; radiance (3, n); weight (3, n): 1 / standard deviation, 0 where not used.
     lower, upper
@@ -235,57 +320,45 @@ def solve(x, form, data, lower, upper, tolerance):
     -------
     (cost, evaluations, status, valleys descended)
     """
-    vectors, f, q, radiance, weight = data
-    diffuse, columns, blocks, energy = np.empty((3, 9)), np.empty((5, f.shape[0])), nearest(q), 0.0
-    for c in range(3):
-        energy += write_diffuse_products(weight[c], vectors, radiance[c], diffuse[c])
-    widths = width_count(lower, upper)
-    lobes = np.empty((widths, 3, 5))
-    for k in range(widths):
-        u = width_at(k, widths, lower, upper)
-        write_lobe_products(u, data, blocks, columns[0], lobes[k])
-    return search(x, form, data, blocks, diffuse, lobes, energy, lower, upper, columns, tolerance)
-
-
-@njit(**JIT)
-def refine(x, form, data, lower, upper, tolerance):
-    """Descend from x, in place, and nowhere else; parameters and result as for `solve`."""
-    vectors, f, q, radiance, weight = data
-    diffuse, columns = np.empty((3, 9)), np.empty((5, f.shape[0]))
-    for c in range(3):
-        write_diffuse_products(weight[c], vectors, radiance[c], diffuse[c])
-    cost, evaluations, status = descend(
-        x, form, data, nearest(q), diffuse, lower, upper, columns, tolerance, MAX_STEPS
+    vectors, f, q, radiance, weight = scan
+    squares, room = squared(weight), np.empty((3, f.shape[0]))
+    return solve_weighted(
+        x, form, (vectors, f, q, radiance, squares, room), lower, upper, tolerance
     )
-    return cost, evaluations, status, 1
 
 
 @njit(**JIT)
-def solve_alike(xs, form, vectors, f, q, radiances, weight, lower, upper, tolerance, costs, counts):
-    """Like `solve` for scans (m, 3, n) that share directions and weights (3, n).
+def solve_weighted(x, form, data, lower, upper, tolerance):
+    """Do what `solve` does for squares of weights; the last of the data is overwritten."""
+    vectors, f, q, radiance, squares, weighted = data
+    nearer, high = nearest_seen(q, squares, lower, upper)
+    if nearer > 0:
+        data = (vectors, f, shifted(q, nearer), radiance, squares, weighted)
+    diffuse, columns, blocks = np.empty((3, 9)), np.empty((3, f.shape[0])), nearest(data[2])
+    energy = write_diffuse_products(data, diffuse)
+    us = widths_between(lower, high)
+    lobes = np.empty((us.shape[0], 3, 5))
+    write_sweep(us, data, blocks, columns[0], lobes)
+    found = search(
+        x, form, data, blocks, diffuse, us, lobes, energy, lower, high, columns, tolerance
+    )
+    seen_amplitudes(x, nearer)
+    return found
 
-    `xs` is (m, 6) or (m, 8), `costs` (m,); `counts` (m, 3) gets evaluations, status and valleys.
-    """
-    n = f.shape[0]
-    columns, blocks, widths = np.empty((5, n)), nearest(q), width_count(lower, upper)
-    lobes, table = np.empty((widths, 3, 5)), np.empty((widths, n))
-    diffuse, weighted = np.empty((3, 9)), np.empty(n)
-    data = (vectors, f, q, radiances[0], weight)
-    for k in range(widths):
-        u = width_at(k, widths, lower, upper)
-        write_lobe_products(u, data, blocks, table[k], lobes[k])
-        zero_outside(u, q, blocks, table[k])
-    for c in range(3):
-        write_diffuse_products(weight[c], vectors, radiances[0, c], diffuse[c])
-    for m in range(xs.shape[0]):
-        energy = 0.0
-        for c in range(3):
-            energy += weigh(weight[c], radiances[m, c], weighted)
-            for j in range(3):
-                diffuse[c, 6 + j] = dot(vectors[j], weighted)
-            for k in range(widths):
-                lobes[k, c, 4] = dot(table[k], weighted)
-        data = (vectors, f, q, radiances[m], weight)
-        costs[m], counts[m, 0], counts[m, 1], counts[m, 2] = search(
-            xs[m], form, data, blocks, diffuse, lobes, energy, lower, upper, columns, tolerance
-        )
+
+@njit(**JIT)
+def refine(x, form, scan, lower, upper, tolerance):
+    """Descend from x, in place, and nowhere else; parameters and result as for `solve`."""
+    vectors, f, q, radiance, weight = scan
+    squares, last = squared(weight), x.shape[0] - 1
+    nearer, high = nearest_seen(q, squares, lower, upper)
+    data = (vectors, f, shifted(q, nearer), radiance, squares, np.empty((3, f.shape[0])))
+    diffuse, columns = np.empty((3, 9)), np.empty((3, f.shape[0]))
+    write_diffuse_products(data, diffuse)
+    x[last] = min(x[last], high[last])
+    seen_amplitudes(x, -nearer)
+    cost, evaluations, status = descend(
+        x, form, data, nearest(data[2]), diffuse, lower, high, columns, tolerance, MAX_STEPS
+    )
+    seen_amplitudes(x, nearer)
+    return cost, evaluations, status, 1

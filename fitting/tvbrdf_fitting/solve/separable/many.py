@@ -1,0 +1,120 @@
+"""Compiled: many scans that share their directions, taken from their arrays as they are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from .elementary import JIT, SUMS
+from .equations import (
+    nearest,
+    write_data_products,
+    write_diffuse_data,
+    write_diffuse_products,
+    write_lobe_products,
+)
+from .search import search, solve_weighted
+from .widths import nearest_seen, seen_amplitudes, shifted, widths_between
+
+
+@njit(**JIT)
+def _take_squares(variance, rows, squares):
+    """Write 1 / variance (n, 3) of some rows as (3, n); return whether all can be used."""
+    good = True
+    for i in range(rows.shape[0]):
+        for c in range(3):
+            spread = variance[rows[i], c]
+            good &= spread > 0  # False for NaN
+            squares[c, i] = 1 / spread
+    return good
+
+
+@njit(**JIT)
+def _transpose(values, one, two, three):
+    for i in range(one.shape[0]):
+        one[i], two[i], three[i] = values[i, 0], values[i, 1], values[i, 2]
+
+
+@njit(fastmath=SUMS, **JIT)
+def _blank(squares, values):
+    """Write 0 where there is no weight; say whether all others are finite."""
+    total = 0.0
+    for i in range(values.shape[0]):
+        value = values[i] if squares[i] > 0 else 0.0
+        values[i] = value
+        total += 0.0 * value
+    return total == 0
+
+
+@njit(**JIT)
+def _take_radiance(values, rows, squares, radiance):
+    """Write values (n, 3) of some rows as (3, n), 0 without weight; say whether all are finite."""
+    n = rows.shape[0]
+    if rows[n - 1] - rows[0] == n - 1:
+        _transpose(values[rows[0] : rows[0] + n], radiance[0], radiance[1], radiance[2])
+    else:
+        for i in range(n):
+            for c in range(3):
+                radiance[c, i] = values[rows[i], c]
+    return (
+        _blank(squares[0], radiance[0])
+        & _blank(squares[1], radiance[1])
+        & _blank(squares[2], radiance[2])
+    )
+
+
+@njit(**JIT)
+def solve_each(
+    xs, form, geometry, radiances, variances, rows, lower, upper, tolerance, costs, counts
+):
+    """Solve scans (m, n, 3) with variances of their own; see `solve_alike`."""
+    vectors, f, q = geometry
+    radiance, squares = np.empty((3, f.shape[0])), np.empty((3, f.shape[0]))
+    data = (vectors, f, q, radiance, squares, np.empty((3, f.shape[0])))
+    for m in range(xs.shape[0]):
+        if not _take_squares(variances[m], rows, squares):
+            return m
+        if not _take_radiance(radiances[m], rows, squares, radiance):
+            return m
+        costs[m], counts[m, 0], counts[m, 1], counts[m, 2] = solve_weighted(
+            xs[m], form, data, lower, upper, tolerance
+        )
+    return -1
+
+
+@njit(**JIT)
+def solve_alike(
+    xs, form, geometry, radiances, variance, rows, lower, upper, tolerance, costs, counts
+):
+    """Solve scans (m, n, 3) that share their variance (n, 3), and with it most of the work.
+
+    `rows` are those that the vectors of `geometry` belong to. `xs` is (m, 6) or (m, 8), `costs`
+    (m,); `counts` (m, 3) gets evaluations, status and valleys. Return the first scan that can't be
+    used, or -1.
+    """
+    vectors, f, q = geometry
+    n = f.shape[0]
+    radiance, squares, weighted = np.zeros((3, n)), np.empty((3, n)), np.empty((3, n))
+    if not _take_squares(variance, rows, squares):
+        return 0
+    nearer, high = nearest_seen(q, squares, lower, upper)
+    data = (vectors, f, shifted(q, nearer), radiance, squares, weighted)
+    blocks, us = nearest(data[2]), widths_between(lower, high)
+    diffuse, columns = np.empty((3, 9)), np.empty((3, n))
+    lobes, falloffs = np.empty((us.shape[0], 3, 5)), np.empty((us.shape[0], n))
+    write_diffuse_products(data, diffuse)
+    for k in range(us.shape[0]):
+        write_lobe_products(math.exp(2 * us[k]), 1, data, blocks, falloffs[k], lobes[k])
+    for m in range(xs.shape[0]):
+        if not _take_radiance(radiances[m], rows, squares, radiance):
+            return m
+        energy = write_diffuse_data(data, diffuse)
+        for k in range(us.shape[0]):
+            write_data_products(math.exp(2 * us[k]), data, blocks, falloffs[k], lobes[k])
+        costs[m], counts[m, 0], counts[m, 1], counts[m, 2] = search(
+            xs[m], form, data, blocks, diffuse, us, lobes, energy, lower, high, columns, tolerance
+        )
+        seen_amplitudes(xs[m], nearer)
+    return -1
