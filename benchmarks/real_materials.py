@@ -15,15 +15,16 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.fit_timing import on_one_thread, write_figures
 from tvbrdf_fitting import FitResult, fit_scan
 from tvbrdf_fitting.choice.choose import choose_model
-from tvbrdf_fitting.error_measures import LOG_SMALLEST_VALUE, ErrorMeasures
+from tvbrdf_fitting.error_measures import LOG_SMALLEST_VALUE
 from tvbrdf_fitting.geometry import CHANNELS, BoolArray, FloatArray
 from tvbrdf_fitting.models import COLOURED, SURFACE, get_model
 from tvbrdf_fitting.observations import Observations
@@ -137,14 +138,14 @@ def _direction(theta: FloatArray, phi: FloatArray) -> FloatArray:
     return np.stack([sine * np.cos(phi), sine * np.sin(phi), np.cos(theta)], axis=1)
 
 
-def shared_and_coloured(folder: Path) -> dict[str, dict[str, ErrorMeasures]]:
+def shared_and_coloured(folder: Path) -> dict[str, dict[str, dict[str, Any]]]:
     """Print ON+TS in the radiance metric, Ks shared and one a channel, with all measures."""
     print("RGL's materials, ON+TS, metric radiance; targets are fits made apart from this project")
     print(
         "  material           Ks        RMS/peak %  target     absolute  RMS/mean   rms_b   "
         "rms_g   rms_r  rms_log  not in log   time ms"
     )
-    figures: dict[str, dict[str, ErrorMeasures]] = {}
+    figures: dict[str, dict[str, dict[str, Any]]] = {}
     for name in MATERIALS:
         observations = read_material(folder, name, _uniform)
         figures[name] = {}
@@ -152,7 +153,8 @@ def shared_and_coloured(folder: Path) -> dict[str, dict[str, ErrorMeasures]]:
             ("shared", "coloured"), (SURFACE, COLOURED), PEAK_TARGETS[name], strict=True
         ):
             result = fit_scan(observations, model)
-            errors = figures[name][label] = result.errors
+            errors = result.errors
+            figures[name][label] = asdict(errors)
             verdict = "met" if round(errors.rms_percent, 2) <= target else "MISSED"
             print(
                 f"  {name:18} {label:9} {errors.rms_percent:9.3f}   {target:4.2f} {verdict:6}"
@@ -263,21 +265,27 @@ def _print_cornell(
     return errors
 
 
-def main(argv: Sequence[str] = ()) -> dict[str, Any]:
-    """Print and return the figures; `argv` may name one of the three parts, `--only gains`."""
-    parts = {"shared": shared_and_coloured, "gains": three_gains, "cornell": cornell}
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.real_materials")
-    parser.add_argument("--only", choices=list(parts), help="one part; by default all")
-    only = parser.parse_args(list(argv)).only
-    chosen = list(parts) if only is None else [only]
-    folder = data_folder()
+PARTS = {"shared": shared_and_coloured, "gains": three_gains, "cornell": cornell}
+
+
+def main() -> dict[str, Any]:
+    """Print and return the figures, with one thread for every library."""
+    return on_one_thread("benchmarks.real_materials")
+
+
+def _run() -> None:
+    parser = argparse.ArgumentParser(description="Fits to real measured materials.")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    parser.add_argument("--only", choices=[*PARTS], help="one part; by default all")
+    given = parser.parse_args()
+    folder, figures = data_folder(), {}
     if folder is None:
         print("Real materials: no measured data; set TVBRDF_SHARED_DATA to their folder")
-        return {}
-    return {name: parts[name](folder) for name in chosen}
+    else:
+        chosen = [*PARTS] if given.only is None else [given.only]
+        figures = {name: PARTS[name](folder) for name in chosen}
+    write_figures(given.json, figures)
 
 
 if __name__ == "__main__":
-    import sys
-
-    main(sys.argv[1:])
+    _run()

@@ -56,26 +56,17 @@ def light_world_angle_deg(direction: ArrayLike, tilt_deg: float = TILT_DEG) -> F
 
     A component out of the light's plane is ignored. The answer lies in (-180, 180] + tilt.
     """
-    vectors = _vectors(direction)
+    vectors = as_vectors(direction)
     return np.rad2deg(np.arctan2(vectors[..., 0], vectors[..., 2])) + tilt_deg
 
 
 def above_horizon(direction: ArrayLike) -> BoolArray:
     """Mask (...) of the directions (..., 3) that are clearly above the sample's horizon."""
-    return np.asarray(_vectors(direction)[..., 2] >= HORIZON_COSINE)
+    return np.asarray(as_vectors(direction)[..., 2] >= HORIZON_COSINE)
 
 
-def turned_in_light_plane(direction: ArrayLike, angle_deg: float) -> FloatArray:
-    """Directions (..., 3) turned as if the light's world angle were larger by `angle_deg`."""
-    vectors = _vectors(direction)
-    angle = np.deg2rad(angle_deg)
-    turned = vectors.copy()
-    turned[..., 0] = np.cos(angle) * vectors[..., 0] + np.sin(angle) * vectors[..., 2]
-    turned[..., 2] = np.cos(angle) * vectors[..., 2] - np.sin(angle) * vectors[..., 0]
-    return turned
-
-
-def _vectors(direction: ArrayLike) -> FloatArray:
+def as_vectors(direction: ArrayLike) -> FloatArray:
+    """Directions (..., 3) as an array; `ValueError` for another shape."""
     vectors = np.asarray(direction, dtype=np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
         raise ValueError(f"directions must have three components last, got shape {vectors.shape}")

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from .geometry import FloatArray
 from .models.torrance_sparrow import half_vector
+from .observations import UNIT_LENGTH_TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ def to_half_angles(light: ArrayLike, view: ArrayLike) -> HalfAngles:
     Raises
     ------
     ValueError
-        Other shapes.
+        Other shapes, or no unit vectors.
     """
     lights, views = paired(light, view)
     radius, height = half_vector(lights, views)
@@ -98,12 +99,16 @@ def paired(light: ArrayLike, view: ArrayLike) -> tuple[FloatArray, FloatArray]:
     Raises
     ------
     ValueError
-        Other shapes.
+        Other shapes, or no unit vectors.
     """
     lights, views = (np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in (light, view))
     for name, array in (("light", lights), ("view", views)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise ValueError(f"{name} directions have shape {array.shape}, expected (n, 3)")
+        unit = np.abs(np.linalg.norm(array, axis=1) - 1) <= UNIT_LENGTH_TOLERANCE
+        if not unit.all():
+            row = int(np.argmin(unit))
+            raise ValueError(f"{name} direction {row} = {array[row].tolist()} is no unit vector")
     if 1 not in {len(lights), len(views)} and len(lights) != len(views):
         raise ValueError(f"{len(lights)} light directions but {len(views)} view directions")
     lights, views = np.broadcast_arrays(lights, views)

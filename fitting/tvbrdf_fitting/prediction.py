@@ -105,16 +105,23 @@ def predict(result: FitResult, light: ArrayLike, view: ArrayLike) -> Prediction:
         Of `fit_scan`.
     light, view
         (n, 3) unit vectors in the sample's frame, or one (3,) for all n.
+
+    Raises
+    ------
+    ValueError
+        Other shapes, or no unit vectors.
     """
     directions = _Directions(get_model(result.model), light, view)
     here = result.internal_values
     value = directions.value(here)
     deviation = _by_covariance(result, directions, value)
-    for index in _undetermined_shapes(result, directions.model):
-        for internal, covariance in _widths(result, index):
-            moved = directions.value(internal) - value
-            variance = _variance(directions.slopes(internal), covariance) + np.square(moved)
-            deviation = np.fmax(deviation, np.sqrt(variance))
+    # a lobe out of sight can have an amplitude of 1e200, whose square is as good as infinite
+    with np.errstate(over="ignore"):
+        for index in _undetermined_shapes(result, directions.model):
+            for internal, covariance in _widths(result, index):
+                moved = directions.value(internal) - value
+                variance = _variance(directions.slopes(internal), covariance) + np.square(moved)
+                deviation = np.fmax(deviation, np.sqrt(variance))
     deviation = np.where(np.isnan(value), np.inf, deviation)
     error = np.nan_to_num(_model_error(result, directions, value))
     value, deviation, error = (
@@ -138,7 +145,7 @@ def predict_over_models(
     Raises
     ------
     ValueError
-        No fits, or fits of different data.
+        No fits, or fits of different data; directions as for `predict`.
     """
     chosen = [f for f in fits if isinstance(f, Contender)]
     if not chosen:
@@ -169,19 +176,16 @@ def weigh(results: Sequence[FitResult]) -> tuple[Contender, ...]:
     Raises
     ------
     ValueError
-        No fits, or of different values or metrics.
+        No fits, or of different values, metrics or losses.
     """
     if not results:
         raise ValueError("no fits to weigh")
     free = [_free_count(result) for result in results]
     counts = [r.degrees_of_freedom + k for r, k in zip(results, free, strict=True)]
-    metrics = {r.metric for r in results}
-    if len(set(counts)) > 1 or len(metrics) > 1:
-        told = ", ".join(f"{r.model}: {n}" for r, n in zip(results, counts, strict=True))
-        raise ValueError(
-            f"fits of different data can't be weighed: values {told}; "
-            f"metrics {', '.join(sorted(metrics))}"
-        )
+    kinds = {(n, r.metric, r.loss) for r, n in zip(results, counts, strict=True)}
+    if len(kinds) > 1:
+        told = "; ".join(f"{n} values, {metric}, {loss}" for n, metric, loss in sorted(kinds))
+        raise ValueError(f"fits of different data, metrics or losses can't be weighed: {told}")
     factor = max(1.0, min(r.chi_square / max(r.degrees_of_freedom, 1) for r in results))
     size = math.log(max(counts[0], 1))
     criteria = [r.chi_square / factor + k * size for r, k in zip(results, free, strict=True)]
@@ -332,7 +336,8 @@ def _variance(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     # as a sum of squares, which rounding can't make negative; of correlations, which are of size 1
     size, axes = np.linalg.eigh(covariance[np.ix_(known, known)] / np.outer(scale, scale))
     root = axes * np.sqrt(np.maximum(size, 0.0)) * scale[:, None]
-    return np.asarray(np.square(np.tensordot(root.T, slopes[known], axes=1)).sum(axis=0))
+    with np.errstate(over="ignore"):  # as good as infinite
+        return np.asarray(np.square(np.tensordot(root.T, slopes[known], axes=1)).sum(axis=0))
 
 
 def _undetermined_shapes(result: FitResult, model: ReflectanceModel) -> list[int]:

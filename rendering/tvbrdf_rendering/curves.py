@@ -6,14 +6,11 @@ As in Fig. 5 of Sun et al., "Time-Varying BRDFs".
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
@@ -21,13 +18,19 @@ from tvbrdf_fitting.models import get_model
 from tvbrdf_fitting.published import CameraScan
 from tvbrdf_fitting.published.database import DatabaseError, StoredFit, StoredSample, StoredScan
 
+from .radiance_axes import (
+    Gaps,
+    dense_angles,
+    draw_points,
+    draw_residuals,
+    gaps_between,
+    legend_entries,
+    shade_gaps,
+)
 from .style import (
     CHANNEL_COLOURS,
-    CHANNEL_NAMES,
-    FAINT,
     INK,
     LABEL_SIZE,
-    SHADE,
     TITLE_SIZE,
     dress,
     legend_above,
@@ -36,12 +39,9 @@ from .style import (
 )
 from .times import time_unit
 
-CURVE_STEP_DEG = 0.1
 LARGEST_PEAK_RATIO = 5.0
 """Where the panels' peaks differ by more, the axis is logarithmic, or the small ones vanish."""
 SMALLEST_SHOWN = 1e-4
-GAP_STEPS = 3.0
-"""Neighbouring lights further apart than this many usual steps have a gap between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Curve:
 
     angle_deg: NDArray[np.float64]
     radiance: NDArray[np.float64]
-    gaps_deg: list[tuple[float, float]]
+    gaps_deg: Gaps
     fit_angle_deg: NDArray[np.float64]
     fit_radiance: NDArray[np.float64]
     residual: NDArray[np.float64]
@@ -74,20 +74,13 @@ def curve_of(camera_scan: CameraScan, fit: StoredFit | None) -> Curve:
     order = np.argsort(angle_deg)
     angle_deg, light = angle_deg[order], light[order]
     radiance = camera_scan.radiance[order]
-    steps = np.diff(angle_deg)
-    usual = float(np.median(steps)) if steps.size else 0.0
-    gaps = [
-        (float(low), float(high))
-        for low, high in pairwise(angle_deg)
-        if high - low > GAP_STEPS * usual > 0
-    ]
+    gaps = gaps_between(angle_deg)
     view = camera_scan.view_direction
     view_deg = float(np.degrees(np.arctan2(view[0], view[2])))
     empty = np.empty((0, 3))
     if fit is None:
         return Curve(angle_deg, radiance, gaps, np.empty(0), empty, empty, view_deg)
-    count = max(int((angle_deg[-1] - angle_deg[0]) / CURVE_STEP_DEG), 1) + 1
-    dense_deg = np.linspace(angle_deg[0], angle_deg[-1], count)
+    dense_deg = dense_angles(angle_deg)
     dense = np.stack([np.interp(dense_deg, angle_deg, light[:, axis]) for axis in range(3)], axis=1)
     dense /= np.linalg.norm(dense, axis=1, keepdims=True)
     residual = radiance - fitted_radiance(fit, light, view)
@@ -153,34 +146,29 @@ def curves_figure(sample: StoredSample, *, camera: int = 1) -> Figure:
     relative = max(peaks) > LARGEST_PEAK_RATIO * min(peaks) > 0
     for column, (scan, curve) in enumerate(panels):
         _plot_radiance(axes[0, column], curve)
-        _plot_residual(axes[1, column], curve, relative=relative)
+        residual = _relative(curve) if relative else curve.residual
+        draw_residuals(axes[1, column], curve, curve.angle_deg, residual)
         title = f"{scan.time_s / unit.seconds:.3g} {unit.sign}  (scan {scan.scan})"
         axes[0, column].set_title(title, fontsize=TITLE_SIZE, color=INK)
         axes[1, column].set_xlabel("light angle / °", fontsize=LABEL_SIZE, color=INK)
     axes[0, 0].set_ylabel(r"radiance  $\pi\,f_r\,\cos\theta_i$", fontsize=LABEL_SIZE, color=INK)
-    residual = "measured\n/ fitted − 1" if relative else "measured\n− fitted"
-    axes[1, 0].set_ylabel(residual, fontsize=LABEL_SIZE, color=INK)
+    label = "measured\n/ fitted − 1" if relative else "measured\n− fitted"
+    axes[1, 0].set_ylabel(label, fontsize=LABEL_SIZE, color=INK)
+    curves = [curve for _, curve in panels]
     if relative:
-        _make_logarithmic(axes[0, 0], axes[1, 0], [curve for _, curve in panels])
+        _make_logarithmic(axes[0, 0], axes[1, 0], curves)
     figure.align_ylabels(axes[:, 0])
-    legend_above(figure, _legend([curve for _, curve in panels]))
+    fitted = any(len(curve.fit_angle_deg) for curve in curves)
+    legend_above(figure, legend_entries(curves, fitted=fitted))
     return figure
 
 
 def _plot_radiance(axes: Axes, curve: Curve) -> None:
     dress(axes)
-    _shade_gaps(axes, curve)
+    shade_gaps(axes, curve)
     for channel, colour in enumerate(CHANNEL_COLOURS):
-        axes.plot(
-            curve.angle_deg,
-            curve.radiance[:, channel],
-            linestyle="none",
-            marker=".",
-            markersize=6.5,
-            markeredgewidth=0,
-            color=colour,
-            alpha=0.35,
-        )
+        measured = curve.radiance[:, channel]
+        draw_points(axes, curve.angle_deg, measured, channel=channel, size=6.5, alpha=0.35)
         axes.plot(curve.fit_angle_deg, curve.fit_radiance[:, channel], color=colour, linewidth=1.1)
     axes.set_xlim(-92, 92)
     axes.xaxis.set_major_locator(FixedLocator(range(-60, 90, 30)))
@@ -208,43 +196,3 @@ def _relative(curve: Curve) -> NDArray[np.float64]:
         fitted > SMALLEST_SHOWN, fitted, np.nan
     )
     return relative
-
-
-def _plot_residual(axes: Axes, curve: Curve, *, relative: bool) -> None:
-    dress(axes, ticks=3)
-    _shade_gaps(axes, curve)
-    axes.axhline(0, color=FAINT, linewidth=0.8)
-    residual = _relative(curve) if relative else curve.residual
-    if len(residual):
-        for channel, colour in enumerate(CHANNEL_COLOURS):
-            axes.plot(
-                curve.angle_deg,
-                residual[:, channel],
-                linestyle="none",
-                marker=".",
-                markersize=3.5,
-                markeredgewidth=0,
-                color=colour,
-                alpha=0.6,
-            )
-
-
-def _shade_gaps(axes: Axes, curve: Curve) -> None:
-    for low, high in curve.gaps_deg:
-        axes.axvspan(low, high, color=SHADE, linewidth=0, zorder=0)
-
-
-def _legend(curves: list[Curve]) -> list[Line2D | Patch]:
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], color=colour, linewidth=1.8, label=name)
-        for colour, name in zip(CHANNEL_COLOURS, CHANNEL_NAMES, strict=True)
-    ]
-    handles.append(
-        Line2D([], [], color=INK, linestyle="none", marker=".", markersize=7, label="measured")
-    )
-    if any(len(curve.fit_angle_deg) for curve in curves):
-        handles.append(Line2D([], [], color=INK, linewidth=1.8, label="fitted"))
-    if any(curve.gaps_deg for curve in curves):
-        arm = all(curve.gaps_are_the_arms for curve in curves)
-        handles.append(Patch(color=SHADE, label="hidden by the arm" if arm else "not measured"))
-    return handles

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, LogFormatterSciNotation, LogLocator, NullLocator
 
 from tvbrdf_fitting.geometry import (
@@ -25,13 +21,19 @@ from tvbrdf_fitting.geometry import (
 from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.result import FitResult
 
+from .radiance_axes import (
+    Gaps,
+    dense_angles,
+    draw_points,
+    draw_residuals,
+    gaps_between,
+    legend_entries,
+    shade_gaps,
+)
 from .style import (
     CHANNEL_COLOURS,
-    CHANNEL_NAMES,
-    FAINT,
     INK,
     LABEL_SIZE,
-    SHADE,
     TITLE_SIZE,
     dress,
     legend_above,
@@ -46,9 +48,7 @@ LOG_DECADES = 5.0
 """A logarithmic axis shows no more decades than this below the peak."""
 LARGEST_LOG_RATIO = 5.0
 """A logarithmic residual's axis ends at this, a factor of 150."""
-CURVE_STEP_DEG = 0.1
-GAP_STEPS, SMALLEST_GAP_DEG = 3.0, 1.5
-"""Lights further apart than this many usual steps, and than this, have a gap between them."""
+SMALLEST_GAP_DEG = 1.5
 _IN_PLANE = 1e-3
 _SMALLEST = 1e-9
 
@@ -76,7 +76,7 @@ class CameraCurve:
     fitted: FloatArray
     curve_deg: FloatArray
     curve: FloatArray
-    gaps_deg: tuple[tuple[float, float], ...]
+    gaps_deg: Gaps
 
     @property
     def gaps_are_the_arms(self) -> bool:
@@ -110,14 +110,10 @@ def _camera_curve(
     angle, light = angle[order], light[order]
     radiance = np.where(usable, observations.radiance, np.nan)[rows][order]
     fitted = fit.radiance(light, observations.view_direction[rows][order])
-    steps = np.diff(angle)
-    usual = float(np.median(steps)) if steps.size else 0.0
-    least = max(GAP_STEPS * usual, SMALLEST_GAP_DEG)
-    gaps = tuple((float(a), float(b)) for a, b in pairwise(angle) if b - a > least)
+    gaps = gaps_between(angle, SMALLEST_GAP_DEG)
     dense, curve = angle, fitted
     if np.abs(light[:, 1]).max() < _IN_PLANE:
-        count = max(int((angle[-1] - angle[0]) / CURVE_STEP_DEG), 1) + 1
-        dense = np.linspace(angle[0], angle[-1], count)
+        dense = dense_angles(angle)
         lights = light_direction(dense, tilt_deg)
         dense, lights = dense[above_horizon(lights)], lights[above_horizon(lights)]
         curve = fit.radiance(lights, np.broadcast_to(view, lights.shape))
@@ -182,10 +178,7 @@ def fit_curves_figure(
         axes[2 * row, column].remove()
         axes[2 * row + 1, column].remove()
     figure.align_ylabels(axes[:, 0])
-    legend_above(figure, _legend(curves))
-    if title:
-        figure.legends[0].set_title(title, prop=FontProperties(size=TITLE_SIZE))
-        figure.legends[0].get_title().set_multialignment("center")
+    legend_above(figure, legend_entries(curves, fitted=True), title)
     return figure
 
 
@@ -201,21 +194,13 @@ def is_logarithmic(curves: list[CameraCurve], axis: AxisKind) -> bool:
 
 def _draw_radiance(axes: Axes, curve: CameraCurve, *, logarithmic: bool) -> None:
     dress(axes)
-    _shade(axes, curve)
+    shade_gaps(axes, curve)
     for channel, colour in enumerate(CHANNEL_COLOURS):
         seen = np.isfinite(curve.radiance[:, channel])
         if logarithmic:
             seen &= np.nan_to_num(curve.radiance[:, channel]) > 0
-        axes.plot(
-            curve.angle_deg[seen],
-            curve.radiance[seen, channel],
-            linestyle="none",
-            marker=".",
-            markersize=5.5,
-            markeredgewidth=0,
-            color=colour,
-            alpha=0.35,
-        )
+        measured = curve.radiance[seen, channel]
+        draw_points(axes, curve.angle_deg[seen], measured, channel=channel, size=5.5, alpha=0.35)
         if np.isfinite(curve.curve[:, channel]).all():
             axes.plot(curve.curve_deg, curve.curve[:, channel], color=colour, linewidth=1.2)
     axes.set_xlim(-93, 93)
@@ -249,42 +234,9 @@ def residuals(curve: CameraCurve, *, logarithmic: bool) -> FloatArray:
 
 
 def _draw_residual(axes: Axes, curve: CameraCurve, *, logarithmic: bool) -> None:
-    dress(axes, ticks=3)
-    _shade(axes, curve)
-    axes.axhline(0, color=FAINT, linewidth=0.8)
     values = residuals(curve, logarithmic=logarithmic)
-    for channel, colour in enumerate(CHANNEL_COLOURS):
-        axes.plot(
-            curve.angle_deg,
-            values[:, channel],
-            linestyle="none",
-            marker=".",
-            markersize=3.5,
-            markeredgewidth=0,
-            color=colour,
-            alpha=0.6,
-        )
+    draw_residuals(axes, curve, curve.angle_deg, values)
     known = np.abs(values[np.isfinite(values)])
     if logarithmic and known.size:  # a few dark values must not make the others a flat line
         reach = min(max(1.3 * float(np.percentile(known, 95)), 1e-3), LARGEST_LOG_RATIO)
         axes.set_ylim(-reach, reach)
-
-
-def _shade(axes: Axes, curve: CameraCurve) -> None:
-    for low, high in curve.gaps_deg:
-        axes.axvspan(low, high, color=SHADE, linewidth=0, zorder=0)
-
-
-def _legend(curves: list[CameraCurve]) -> list[Line2D | Patch]:
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], color=colour, linewidth=1.8, label=name)
-        for colour, name in zip(CHANNEL_COLOURS, CHANNEL_NAMES, strict=True)
-    ]
-    handles += [
-        Line2D([], [], color=INK, linestyle="none", marker=".", markersize=7, label="measured"),
-        Line2D([], [], color=INK, linewidth=1.8, label="fitted"),
-    ]
-    if any(curve.gaps_deg for curve in curves):
-        arm = all(curve.gaps_are_the_arms for curve in curves)
-        handles.append(Patch(color=SHADE, label="hidden by the arm" if arm else "not measured"))
-    return handles

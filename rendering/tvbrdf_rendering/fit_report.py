@@ -9,19 +9,20 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from tvbrdf_fitting.error_measures import ErrorMeasures, pool
-from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.models import get_model
 from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.published import write_atomically
 from tvbrdf_fitting.published.database import StoredFit, StoredSample, StoredScan
 from tvbrdf_fitting.result import FitResult
+
+from .trend import Trend, trend_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from tvbrdf_fitting.choice.choose import ModelChoice
 
 DataSource = Literal["frames", "grid"]
-SIGNIFICANT = 3.0
-"""Deviations from which a change is one."""
 _UNTIMED_LIMIT = 180
 _NUMBERED_CHANNEL = re.compile(r"(.+)_([bgr])_(\d+)")
 
@@ -154,48 +153,6 @@ class FittedSample:
         }
 
 
-@dataclass(frozen=True)
-class Trend:
-    """How one parameter moves from scan to scan, over the scans that determine it.
-
-    Attributes
-    ----------
-    name, unit
-        Parameter.
-    scans
-        Number of scans in which it is determined and not at a bound.
-    first, last
-        Values in the first and the last of them.
-    mean, mean_deviation
-        Weighted by the random variances.
-    scatter
-        Chi-square of a constant by its degrees of freedom.
-    slope, slope_deviation
-        Of a straight line, by `per` ("min" or "scan"). What it leaves beyond noise is added to the
-        noise of every value.
-    kind
-        "constant" within noise, "rises" or "falls" where the line's slope is significant, else
-        "varies"; "unknown" with fewer than three scans.
-    """
-
-    name: str
-    unit: str
-    scans: int
-    first: float | None = None
-    last: float | None = None
-    mean: float | None = None
-    mean_deviation: float | None = None
-    scatter: float | None = None
-    slope: float | None = None
-    slope_deviation: float | None = None
-    per: str = "scan"
-    kind: Literal["constant", "rises", "falls", "varies", "unknown"] = "unknown"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything as plain Python types."""
-        return asdict(self)
-
-
 def trends(sample: FittedSample) -> tuple[Trend, ...]:
     """Return the trend of every parameter that is not fixed; none if the models differ."""
     models = {scan.fit.model for scan in sample.scans}
@@ -219,45 +176,7 @@ def _trend(sample: FittedSample, name: str, unit: str) -> Trend:
         time = scan.time_s / 60 if sample.has_times and scan.time_s is not None else scan.scan
         if name not in fit.undetermined + fit.at_bound and deviation > 0:
             rows.append((float(time), fit.value(name), deviation))
-    if len(rows) < 3:
-        return Trend(name, unit, len(rows))
-    time, value, deviation = np.array(rows).T
-    weight = deviation**-2
-    mean = float(weight @ value / weight.sum())
-    freedom = len(rows) - 1
-    scatter = float(weight @ np.square(value - mean)) / freedom
-    slope, slope_deviation = _slope(time, value, deviation)
-    kind: Literal["constant", "rises", "falls", "varies"] = "varies"
-    if abs(slope) > SIGNIFICANT * slope_deviation:
-        kind = "rises" if slope > 0 else "falls"
-    elif scatter <= 1.0 + SIGNIFICANT * math.sqrt(2.0 / freedom):
-        kind = "constant"
-    return Trend(
-        name,
-        unit,
-        len(rows),
-        first=float(value[0]),
-        last=float(value[-1]),
-        mean=mean,
-        mean_deviation=float(weight.sum() ** -0.5),
-        scatter=scatter,
-        slope=slope,
-        slope_deviation=slope_deviation,
-        per="min" if sample.has_times else "scan",
-        kind=kind,
-    )
-
-
-def _slope(time: FloatArray, value: FloatArray, deviation: FloatArray) -> tuple[float, float]:
-    """Slope of a straight line and its deviation; what the line leaves counts as noise too."""
-    whole = value - value.mean()
-    away = time - time.mean()
-    left = whole - float(away @ whole) / float(away @ away) * away
-    excess = max(float(left @ left) / max(len(time) - 2, 1) - float(np.mean(deviation**2)), 0.0)
-    weight = 1.0 / (np.square(deviation) + excess)
-    away = time - float(weight @ time / weight.sum())
-    leverage = float(weight @ np.square(away))
-    return float(weight @ (away * value)) / leverage, leverage**-0.5
+    return trend_of(name, unit, rows, per="min" if sample.has_times else "scan")
 
 
 def pictured(sample: FittedSample) -> tuple[FittedScan, ...]:

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
@@ -24,13 +23,14 @@ from tvbrdf_fitting.result import FitResult
 
 from .style import (
     CHANNEL_COLOURS,
-    CHANNEL_NAMES,
     FAINT,
     INK,
     SHADE,
     TICK_SIZE,
     TITLE_SIZE,
+    channel_entries,
     legend_above,
+    measured_entry,
     new_figure,
     save,
 )
@@ -217,10 +217,7 @@ def lobe_figure(
         else:
             cell.remove()
     shared = all(_shared(panel.specular) for panel in panels)
-    legend_above(figure, _legend(panels, shared=shared, logarithmic=logarithmic))
-    if title:
-        figure.legends[0].set_title(title, prop=FontProperties(size=TITLE_SIZE))
-        figure.legends[0].get_title().set_multialignment("center")
+    legend_above(figure, _legend(panels, shared=shared, logarithmic=logarithmic), title)
     return figure
 
 
@@ -376,10 +373,7 @@ def _shared(specular: FloatArray) -> bool:
 def _legend(panels: list[Lobe], *, shared: bool, logarithmic: bool) -> list[Line2D]:
     radius = "BRDF / (1/sr), log scale" if logarithmic else "BRDF / (1/sr)"
     handles = [
-        Line2D([], [], color=colour, linewidth=1.8, label=name)
-        for colour, name in zip(CHANNEL_COLOURS, CHANNEL_NAMES, strict=True)
-    ]
-    handles += [
+        *channel_entries(),
         Line2D([], [], color=INK, linewidth=1.5, label=radius),
         Line2D([], [], color=INK, linewidth=1.3, linestyle="--", label="diffuse part"),
     ]
@@ -387,7 +381,5 @@ def _legend(panels: list[Lobe], *, shared: bool, logarithmic: bool) -> list[Line
         label = "specular part (all channels)" if shared else "specular part"
         handles.append(Line2D([], [], color=INK, linewidth=1.3, linestyle=":", label=label))
     if any(len(panel.measured) for panel in panels):
-        handles.append(
-            Line2D([], [], color=INK, linestyle="none", marker=".", markersize=7, label="measured")
-        )
+        handles.append(measured_entry())
     return handles

@@ -17,9 +17,9 @@ from .style import (
     FAINT,
     INK,
     LABEL_SIZE,
-    SHADE,
     TICK_SIZE,
     TITLE_SIZE,
+    frame,
     new_figure,
     save,
 )
@@ -226,17 +226,11 @@ def _lights_panel(axes: Axes, cells: Sequence[Measured]) -> None:
 
 
 def _dress(axes: Axes) -> None:
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(FAINT)
+    frame(axes)
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_formatter(FuncFormatter(_per_cent))
-    axes.grid(visible=True, color=SHADE, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=TICK_SIZE, color=FAINT, labelcolor=INK)
 
 
 def _legend_below(figure: Figure, cells: Sequence[Measured]) -> None:

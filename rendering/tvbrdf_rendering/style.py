@@ -14,7 +14,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from tvbrdf_fitting.published import write_atomically
@@ -44,8 +46,8 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
-def dress(axes: Axes, *, ticks: int = 5) -> None:
-    """Give axes a light grid, plain numbers, and readable ticks."""
+def frame(axes: Axes) -> None:
+    """Give axes a light grid, a faint frame on two sides, and readable ticks."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -53,18 +55,36 @@ def dress(axes: Axes, *, ticks: int = 5) -> None:
     axes.grid(visible=True, color=SHADE, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=TICK_SIZE, color=FAINT, labelcolor=INK)
+
+
+def dress(axes: Axes, *, ticks: int = 5) -> None:
+    """Give axes a light grid, plain numbers, and readable ticks."""
+    frame(axes)
     axes.yaxis.set_major_locator(MaxNLocator(ticks))
     formatter = ScalarFormatter(useOffset=False)
     formatter.set_powerlimits((-3, 5))
     axes.yaxis.set_major_formatter(formatter)
 
 
-def legend_above(figure: Figure, handles: Sequence[Any]) -> None:
+def channel_entries() -> list[Line2D]:
+    """Return a legend's entries for the colours of the channels."""
+    return [
+        Line2D([], [], color=colour, linewidth=1.8, label=name)
+        for colour, name in zip(CHANNEL_COLOURS, CHANNEL_NAMES, strict=True)
+    ]
+
+
+def measured_entry() -> Line2D:
+    """Return a legend's entry for measured points."""
+    return Line2D([], [], color=INK, linestyle="none", marker=".", markersize=7, label="measured")
+
+
+def legend_above(figure: Figure, handles: Sequence[Any], title: str = "") -> None:
     """Put one legend for all axes above them, in as many rows as the width needs."""
     columns = max(int(figure.get_figwidth() / WIDEST_ENTRY_IN), 1)
     if len(handles) > columns:
         columns = -(-len(handles) // 2)
-    figure.legend(
+    legend = figure.legend(
         handles=list(handles),
         loc="outside upper center",
         ncols=min(columns, len(handles)),
@@ -73,6 +93,9 @@ def legend_above(figure: Figure, handles: Sequence[Any]) -> None:
         handletextpad=0.5,
         columnspacing=1.6,
     )
+    if title:
+        legend.set_title(title, prop=FontProperties(size=TITLE_SIZE))
+        legend.get_title().set_multialignment("center")
 
 
 def save(figure: Figure, path: Path | str, *, dpi: int = 150) -> Path:

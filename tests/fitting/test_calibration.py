@@ -12,6 +12,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.paths import CALIBRATION_FILE
 from tvbrdf_fitting.geometry import view_direction
 from tvbrdf_fitting.measurement.calibration import (
     Calibration,
@@ -22,17 +23,15 @@ from tvbrdf_fitting.measurement.calibration import (
     parse_calibration,
 )
 
-FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
-
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    return load_calibration(FILE)
+    return load_calibration(CALIBRATION_FILE)
 
 
 @pytest.fixture
 def data() -> dict[str, Any]:
-    loaded = yaml.safe_load(FILE.read_text())
+    loaded = yaml.safe_load(CALIBRATION_FILE.read_text())
     assert isinstance(loaded, dict)
     return loaded
 
@@ -118,7 +117,9 @@ def test_a_camera_overrides_what_holds_for_every_camera(data: dict[str, Any]) ->
 
 
 def test_numbers_that_yaml_reads_as_text_are_understood() -> None:
-    text = FILE.read_text().replace("relative_noise_std: 0.001", "relative_noise_std: 1e-3")
+    text = CALIBRATION_FILE.read_text().replace(
+        "relative_noise_std: 0.001", "relative_noise_std: 1e-3"
+    )
     assert parse_calibration(text).camera(1).relative_noise_std == 1e-3
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import chain, combinations, pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from tests.fitting.scans import SATIN
+from tests.paths import CALIBRATION_FILE
 from tvbrdf_fitting import CommonErrors, fit_scan, get_model
 from tvbrdf_fitting.design.fisher_information import Information, NoiseModel, Rig
 from tvbrdf_fitting.design.search import (
@@ -29,7 +30,6 @@ from tvbrdf_fitting.measurement.calibration import load_calibration
 
 EXPOSURES_MS = (0.2, 4.0, 32.0)
 MATTE = [0.3, 0.5, 0.7, 0.4, 0.02, 3.0]
-SATIN = [0.3, 0.5, 0.7, 0.4, 0.8, 6.0]
 SHARP = [0.05, 0.12, 0.4, 0.2, 3.0, 50.0]
 DUST = [0.3, 0.5, 0.7, 0.4, 0.8, 6.0, 0.05, 0.06, 0.07, 0.35, 0.5]
 COMMON = CommonErrors(light_angle_std_deg=0.02, gain_relative_std=0.005, plate_tilt_std_deg=0.05)
@@ -84,7 +84,7 @@ def test_flicker_that_channels_share_counts_once() -> None:
     quiet = NoiseModel(pixels=10**9, read_noise_e=1.0, frame_relative_std=0.01)
     alone = Information(Rig(noise=quiet), "ON+TS", SATIN, (4.0,))
     together = alone.deviations((1,), (4.0,), 40).internal
-    blocks, excess = alone.blocks(40)
+    blocks, excess, _ = alone.blocks(40)
     own = np.linalg.inv(blocks[0, 0])
     assert together[4] ** 2 == pytest.approx((own + own @ excess[0, 0] @ own)[4, 4], rel=1e-9)
     # as if each channel had its own flicker, it would be nearly the root of 3 too small
@@ -104,6 +104,15 @@ def test_more_cameras_never_hurt() -> None:
             assert (known[more] <= known[some] * (1 + 1e-6)).all(), (some, more)
 
 
+def test_fewer_values_than_parameters_determine_nothing() -> None:
+    """Cameras 3 and 4 see no lobe of 1 degree, and a fit refuses three values all the same."""
+    values = [0.3, 0.5, 0.7, 0.8, 50.0]
+    information = Information(NOISY, "lambert+torrance_sparrow", values, (4.0,))
+    assert np.isinf(information.deviations((4,), (4.0,), 1).published).all()
+    two = information.deviations((3, 4), (4.0,), 1).published
+    np.testing.assert_array_equal(np.isfinite(two), [True, True, True, False, False])
+
+
 def test_lights_are_spread_over_the_horizon() -> None:
     rig = Rig()
     angle = rig.lights_deg(100, 0.125)
@@ -117,6 +126,12 @@ def test_lights_are_spread_over_the_horizon() -> None:
     gap = np.abs(rig.lights_deg(100)) <= 1.75
     assert seen == [100 - gap.sum(), 100]
     assert gap.sum() == 2
+    # wherever it is in the list, the camera in the light's plane is the one behind the arm
+    turned = replace(rig, camera_angles_deg=(25.0, 0.0))
+    hidden = turned.observe(
+        get_model("ON+TS"), np.array(SATIN), cameras=(1, 2), exposures_ms=(4.0,), lights=100
+    )
+    assert [int((hidden.camera == camera).sum()) for camera in (1, 2)] == [100, 98]
     assert rig.time_s(361, (0.2, 4.0)) == pytest.approx(2 * 361 / 30)
     assert rig.time_s(20, EXPOSURES_MS) == pytest.approx(36.0)
     assert rig.time_s(200, (100.0,)) == pytest.approx(20.0)
@@ -124,8 +139,7 @@ def test_lights_are_spread_over_the_horizon() -> None:
 
 def test_the_noise_is_the_simulated_rigs() -> None:
     """By the calibration file's own formula, for a white diffuser and a dark one."""
-    path = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
-    camera = load_calibration(path).cameras[2]
+    camera = load_calibration(CALIBRATION_FILE).cameras[2]
     noise = NoiseModel()
     radiance, exposure = np.array([[1.0, 0.1, 0.0]]), np.array([4.0])
     scale = np.array(camera.radiance_per_dn_per_ms) / exposure[:, None]
@@ -318,10 +332,15 @@ def test_what_nothing_depends_on_is_not_asked_for() -> None:
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"cameras": (5,)}, "cameras 5 .the rig has 1, 2, 3, 4"),
+        ({"cameras": (5,)}, r"cameras \[5\] .the rig has \[1, 2, 3, 4\]"),
         ({"cameras": ()}, "at least one"),
         ({"exposures_ms": (0.0,)}, "above 0"),
-        ({"most_lights": 0}, "at least one light"),
+        ({"exposures_ms": (np.inf,)}, r"exposures of \[inf\]"),
+        ({"exposures_ms": ()}, r"exposures of \[\]"),
+        ({"most_lights": 0}, "at least one is needed"),
+        ({"most_lights": 10**9}, "take too long"),
+        ({"fixed": get_model("ON+TS").parameter_names}, "every parameter is fixed or any"),
+        ({"accuracy": dict.fromkeys(get_model("ON+TS").parameter_names, Accuracy(np.inf))}, "any"),
         ({"fixed": ("w",)}, "no parameter 'w'; it has kd_b"),
         ({"accuracy": {"kx": Accuracy(0.1)}}, "no parameter 'kx'"),
     ],
@@ -346,11 +365,15 @@ def test_impossible_materials_rigs_and_noise_are_refused() -> None:
     for part in fields(NoiseModel):
         with pytest.raises(ValueError, match=part.name):
             NoiseModel(**{part.name: -1})
+    for wrong in ({"tilt_deg": np.nan}, {"tilt_deg": 90.0}, {"camera_angles_deg": (0.0, 95.0)},
+                  {"sweep_deg": (10.0, -10.0)}, {"sweep_deg": (-np.inf, 90.0)}):  # fmt: skip
+        with pytest.raises(ValueError, match=f"rig: {next(iter(wrong))}"):
+            Rig(**wrong)
 
 
 def test_other_rigs() -> None:
     """Two cameras, flat plate: the rig is no constant."""
-    rig = Rig(camera_angles_deg=(10.0, 60.0), tilt_deg=0.0, sweep_deg=(-60.0, 60.0), hidden_deg={})
+    rig = Rig(camera_angles_deg=(10.0, 60.0), tilt_deg=0.0, sweep_deg=(-60.0, 60.0))
     study = study_of(SATIN, rig)
     assert study.fewest is not None
     assert set(study.fewest.cameras) <= {1, 2}

@@ -14,36 +14,15 @@ import numpy as np
 import pytest
 
 import tvbrdf_fitting
-from tvbrdf_fitting import CommonErrors, FitError, FitResult, Observations, fit_scan, get_model
+from tests.fitting.scans import DUSTY, GLOSSY, LAMBERT, ROUGH, SATIN, Simulate, sound
+from tvbrdf_fitting import CommonErrors, FitError, Observations, fit_scan, get_model
 from tvbrdf_fitting.fit import SOLVERS
 from tvbrdf_fitting.problem import make_problem
 from tvbrdf_fitting.solve.solvers import solve_trust_region
 
-Simulate = Callable[..., Observations]
-
-GLOSSY = [0.05, 0.12, 0.4, 0.1, 3.0, 25.0]
-SATIN = [0.3, 0.5, 0.7, 0.4, 0.8, 6.0]
-ROUGH = [0.6, 0.55, 0.5, 0.9, 0.15, 2.0]
 MIRROR = [0.02, 0.3, 0.1, 0.3, 20.0, 120.0]
 BROAD = [0.2, 0.2, 0.2, 0.3, 0.3, 1.2]
-LAMBERT = [0.3, 0.5, 0.7, 0.0, 0.8, 6.0]
-DUSTY = [*SATIN, 0.05, 0.06, 0.07, 0.35, 0.6]
 THIN_DUST = [*GLOSSY, 0.08, 0.09, 0.1, -0.3, 0.08]
-
-
-def plain(result: FitResult) -> FitResult:
-    """Check what holds for every result, and return it."""
-    assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["model"] == result.model
-    lower, upper = get_model(result.model).bounds
-    seen = np.isfinite(result.values)
-    slack = 1e-9 * np.abs(result.values[seen])
-    assert (result.values[seen] >= lower[seen] - slack).all()
-    assert (result.values[seen] <= upper[seen] + slack).all()
-    variance = np.diag(result.covariance)
-    assert (variance[np.isfinite(variance)] >= 0).all()
-    unknown = ~np.isfinite(result.standard_deviations)
-    assert set(np.array(result.parameter_names)[unknown]) <= set(result.undetermined)
-    return result
 
 
 class TestRecovery:
@@ -52,20 +31,20 @@ class TestRecovery:
     @pytest.mark.parametrize("method", list(SOLVERS))
     @pytest.mark.parametrize("truth", [GLOSSY, SATIN, ROUGH, MIRROR, BROAD])
     def test_surface(self, simulate: Simulate, truth: list[float], method: str) -> None:
-        result = plain(fit_scan(simulate(truth, step=3), method=method))
+        result = sound(fit_scan(simulate(truth, step=3), method=method))
         np.testing.assert_allclose(result.values, truth, rtol=1e-7)
         assert result.at_bound == ()
         assert result.undetermined == ()
 
     @pytest.mark.parametrize("truth", [DUSTY, THIN_DUST])
     def test_dust_with_everything_free(self, simulate: Simulate, truth: list[float]) -> None:
-        result = plain(fit_scan(simulate(truth, "dust", step=3), "dust"))
+        result = sound(fit_scan(simulate(truth, "dust", step=3), "dust"))
         np.testing.assert_allclose(result.values, truth, rtol=1e-6)
 
     @pytest.mark.parametrize("form", ["paper", "blinn"])
     def test_printed_forms_of_dust(self, simulate: Simulate, form: Any) -> None:
         model = get_model("dust", form=form)
-        result = plain(fit_scan(simulate(DUSTY, model.name, step=3), model))
+        result = sound(fit_scan(simulate(DUSTY, model.name, step=3), model))
         np.testing.assert_allclose(result.values, DUSTY, rtol=1e-6)
         assert result.model == model.name
 
@@ -74,14 +53,14 @@ class TestRecovery:
         known = get_model("dust").as_mapping(truth)
         free = {"tau", "ks", "inverse_sigma_s"}
         fixed = {name: value for name, value in known.items() if name not in free}
-        result = plain(fit_scan(simulate(truth, "dust", step=3), "dust", fixed=fixed))
+        result = sound(fit_scan(simulate(truth, "dust", step=3), "dust", fixed=fixed))
         np.testing.assert_allclose(result.values, truth, rtol=1e-9)
         assert set(result.fixed) == set(fixed)
         assert [result.standard_deviation(n) for n in fixed] == [0.0] * len(fixed)
         assert all(result.standard_deviation(n) > 0 for n in free)
 
     def test_lambert_ends_at_the_bound_of_sigma_d(self, simulate: Simulate) -> None:
-        result = plain(fit_scan(simulate(LAMBERT, step=3)))
+        result = sound(fit_scan(simulate(LAMBERT, step=3)))
         np.testing.assert_allclose(result.values, LAMBERT, rtol=1e-7, atol=1e-4)
         assert result.at_bound == ("sigma_d",)
         # three published deviations reach as far as three of sigma_d^2
@@ -116,7 +95,7 @@ def test_real_materials_fit_as_well_as_elsewhere(
     real_material: Callable[[str], Observations], name: str, orientation: float
 ) -> None:
     # figures of a fit made apart from this project, given with two decimals
-    result = plain(fit_scan(real_material(name)))
+    result = sound(fit_scan(real_material(name)))
     assert result.errors.rms_percent <= orientation + 0.005
     assert "sigma_d" in result.at_bound
 
@@ -152,7 +131,7 @@ def test_global_minimum_of_random_scenes(simulate: Simulate) -> None:
         ]
         gains = 1 + 0.02 * rng.normal(size=(4, 3)) * (seed % 2)
         observations = simulate(truth, noise=0.01, seed=seed, step=8, gains=gains)
-        result = plain(fit_scan(observations, model_error=False))
+        result = sound(fit_scan(observations, model_error=False))
         problem = make_problem(observations, get_model("ON+TS"), {}, {})
         best = problem.cost(solve_trust_region(problem).internal)
         assert 0.5 * result.chi_square <= best * (1 + 1e-6)
@@ -228,7 +207,7 @@ class TestUncertainty:
 
 class TestRequests:
     def test_fixed_values_stay(self, simulate: Simulate) -> None:
-        result = plain(fit_scan(simulate(SATIN, step=6), fixed={"sigma_d": 0.2, "kd_b": 0.25}))
+        result = sound(fit_scan(simulate(SATIN, step=6), fixed={"sigma_d": 0.2, "kd_b": 0.25}))
         assert result.value("sigma_d") == 0.2
         assert result.value("kd_b") == 0.25
         assert result.fixed == ("kd_b", "sigma_d")
@@ -236,7 +215,7 @@ class TestRequests:
 
     def test_everything_fixed_only_measures_the_error(self, simulate: Simulate) -> None:
         fixed = get_model("ON+TS").as_mapping(SATIN)
-        result = plain(fit_scan(simulate(SATIN, step=6), fixed=fixed))
+        result = sound(fit_scan(simulate(SATIN, step=6), fixed=fixed))
         assert result.errors.rms_absolute < 1e-12
         assert result.errors.count == result.degrees_of_freedom
 
@@ -246,7 +225,8 @@ class TestRequests:
         near = {n: 1.05 * v for n, v in found.parameters.items()}
         again = fit_scan(observations, initial=near)
         np.testing.assert_allclose(again.values, found.values, rtol=1e-5)
-        assert again.evaluations <= found.evaluations
+        # the search's own start can be nearer than 5 %
+        assert again.evaluations <= found.evaluations + 2
         partly = fit_scan(observations, initial={"inverse_sigma_s": 5.0})
         np.testing.assert_allclose(partly.values, found.values, rtol=1e-5)
 
@@ -308,10 +288,10 @@ class TestRequests:
         observations = simulate(SATIN, noise=0.01, step=6)
         free = fit_scan(observations, method=method)
         loose = {"inverse_sigma_s": (5.0, 7.0), "kd_b": (-math.inf, 0.4), "ks": (0.1, math.inf)}
-        same = plain(fit_scan(observations, method=method, bounds=loose))
+        same = sound(fit_scan(observations, method=method, bounds=loose))
         np.testing.assert_allclose(same.values, free.values, rtol=1e-5)
         tight = {"inverse_sigma_s": (10.0, 20.0), "kd_b": (0.1, 0.2), "sigma_d": (0.3, 0.35)}
-        held = plain(fit_scan(observations, method=method, bounds=tight))
+        held = sound(fit_scan(observations, method=method, bounds=tight))
         for name, (low, high) in tight.items():
             assert low * (1 - 1e-6) <= held.value(name) <= high * (1 + 1e-6)
         # each of them pulls towards the free answer
@@ -324,7 +304,7 @@ class TestRequests:
         grey = [0.4, 0.4, 0.4, 0.4, 0.8, 6.0]
         observations = simulate(grey, noise=0.01, step=6)
         free = fit_scan(observations, method=method)
-        tied = plain(fit_scan(observations, method=method, tied={"kd_g": "kd_b", "kd_r": "kd_b"}))
+        tied = sound(fit_scan(observations, method=method, tied={"kd_g": "kd_b", "kd_r": "kd_b"}))
         assert tied.tied == {"kd_g": "kd_b", "kd_r": "kd_b"}
         assert tied.value("kd_b") == tied.value("kd_g") == tied.value("kd_r")
         assert tied.degrees_of_freedom == free.degrees_of_freedom + 2
@@ -338,7 +318,7 @@ class TestRequests:
         assert 0 <= tied.chi_square - free.chi_square < 18.4
 
     def test_a_tied_parameter_follows_a_fixed_one(self, simulate: Simulate) -> None:
-        result = plain(
+        result = sound(
             fit_scan(simulate(SATIN, step=6), tied={"kd_g": "kd_b"}, fixed={"kd_b": 0.45})
         )
         assert result.value("kd_g") == result.value("kd_b") == 0.45
@@ -349,7 +329,7 @@ class TestRequests:
         observations = simulate(SATIN, step=6)
         alive = observations.valid.copy()
         alive[:, 0] = False
-        result = plain(fit_scan(replace(observations, valid=alive), tied={"kd_g": "kd_b"}))
+        result = sound(fit_scan(replace(observations, valid=alive), tied={"kd_g": "kd_b"}))
         assert result.value("kd_b") == result.value("kd_g") == pytest.approx(0.5)
         assert "kd_b" not in result.undetermined
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -12,16 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tvbrdf_fitting import FitResult, Observations, fit_scan, get_model
+from tests.fitting.scans import SATIN, Simulate
+from tvbrdf_fitting import FitResult, fit_scan, get_model
 from tvbrdf_fitting.fit import SOLVERS
 from tvbrdf_fitting.models import Parameter, ReflectanceModel, catalogue
-
-Simulate = Callable[..., Observations]
 
 MODELS = tuple(name for name in catalogue() if not get_model(name).delta)
 LINEAR = "lambert+torrance_sparrow"
 LINEAR_SATIN = [0.3, 0.5, 0.7, 0.8, 6.0]
-SATIN = [0.3, 0.5, 0.7, 0.4, 0.8, 6.0]
 FEW = settings(max_examples=25, deadline=None, derandomize=True)
 VERY_FEW = settings(max_examples=5, deadline=None, derandomize=True)
 SOLVED = 0.01

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tvbrdf_fitting import FitError, Observations, fit_scan, fit_scans
+from tests.fitting.scans import Simulate
+from tvbrdf_fitting import FitError, fit_scan, fit_scans
 
-Simulate = Callable[..., Observations]
 SATIN = [0.3, 0.5, 0.7, 0.3, 0.8, 8.0]
 
 

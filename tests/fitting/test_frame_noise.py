@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import binomtest, norm
 
+from tests.fitting.scans import Simulate
 from tvbrdf_fitting import CommonErrors, Observations, fit_scan
-
-Simulate = Callable[..., Observations]
 
 TRUTH = [0.30, 0.50, 0.70, 0.40, 0.80, 6.0]
 FLICKER = 0.01

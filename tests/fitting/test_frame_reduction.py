@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tests.paths import CALIBRATION_FILE
 from tvbrdf_fitting.measurement.calibration import CameraCalibration, Rectangle, load_calibration
-from tvbrdf_fitting.measurement.frame_reduction import FrameReducer, is_saturated, reduce_frame
+from tvbrdf_fitting.measurement.frame_reduction import FrameReducer, is_saturated
 from tvbrdf_fitting.measurement.response import Response
 
-FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
-CAMERA = load_calibration(FILE).camera(1)
+CAMERA = load_calibration(CALIBRATION_FILE).camera(1)
 RESPONSES = (
     Response(),
     Response("gamma", exponent=0.4545),
@@ -51,7 +50,7 @@ def test_agrees_with_direct_computation(
     random = np.random.default_rng(seed)
     image: Any = random.integers(low, high, (height, width, 3)).astype(dtype)
 
-    statistics = reduce_frame(image, camera)
+    statistics = FrameReducer(camera).reduce(image)
 
     assert statistics.reference is not None
     assert camera.reference_patch is not None
@@ -84,12 +83,12 @@ def test_a_reducer_keeps_nothing_of_earlier_frames() -> None:
 def test_the_frame_is_not_changed_and_may_be_read_only() -> None:
     image = np.full((32, 32, 3), 4095, dtype=np.uint16)
     image.setflags(write=False)
-    assert reduce_frame(image, CAMERA).patch.mean_dn.tolist() == [4095.0] * 3
+    assert FrameReducer(CAMERA).reduce(image).patch.mean_dn.tolist() == [4095.0] * 3
 
 
 def test_without_a_reference_there_is_none() -> None:
     image = np.full((32, 32, 3), 100, dtype=np.uint16)
-    assert reduce_frame(image, replace(CAMERA, reference_patch=None)).reference is None
+    assert FrameReducer(replace(CAMERA, reference_patch=None)).reduce(image).reference is None
 
 
 @pytest.mark.parametrize(
@@ -104,7 +103,7 @@ def test_without_a_reference_there_is_none() -> None:
 )
 def test_frames_that_are_not_the_cameras_are_refused(image: NDArray[Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        reduce_frame(image, CAMERA)
+        FrameReducer(CAMERA).reduce(image)
 
 
 def noisy(camera: CameraCalibration, signal_dn: float, seed: int) -> NDArray[np.uint16]:
@@ -124,7 +123,7 @@ def test_partly_saturated_patches_do_not_bias() -> None:
     noise = float(np.sqrt(CAMERA.pixel_variance_dn2(3900.0)))
     for index, distance in enumerate(np.linspace(-12.0, 2.0, 141)):
         signal = 4095.0 - 64.0 + distance * noise
-        region = reduce_frame(noisy(CAMERA, signal, index), CAMERA).patch
+        region = FrameReducer(CAMERA).reduce(noisy(CAMERA, signal, index)).patch
         masked = is_saturated(region, black, CAMERA)
         masked_any += int(masked.sum())
         std = np.sqrt(CAMERA.pixel_variance_dn2(signal) / region.pixel_count)
@@ -155,7 +154,7 @@ def test_hot_pixels_are_allowed_for_when_the_calibration_says_so() -> None:
     image[3, 5] = 4095
     black = np.full(3, CAMERA.black_level_dn)
     tolerant = replace(CAMERA, max_saturated_fraction=1e-3)
-    region = reduce_frame(image, CAMERA).patch
+    region = FrameReducer(CAMERA).reduce(image).patch
     assert region.saturated_count.tolist() == [1, 1, 1]
     assert is_saturated(region, black, CAMERA).all()
     assert not is_saturated(region, black, tolerant).any()

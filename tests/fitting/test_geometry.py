@@ -10,7 +10,6 @@ from tvbrdf_fitting.geometry import (
     above_horizon,
     light_direction,
     light_world_angle_deg,
-    turned_in_light_plane,
     view_direction,
 )
 
@@ -61,13 +60,6 @@ def test_smallest_half_angles_are_those_of_the_facts() -> None:
         smallest.append(np.rad2deg(np.arctan2(np.hypot(half[:, 0], half[:, 1]), half[:, 2]).min()))
     # the facts give one decimal; the sweep's step is 0.005 degrees
     np.testing.assert_allclose(smallest, (0.0, 12.7, 25.3, 37.6), atol=0.06)
-
-
-def test_turning_a_light_is_a_larger_world_angle() -> None:
-    light = light_direction([-60.0, 0.0, 33.0])
-    np.testing.assert_allclose(
-        turned_in_light_plane(light, 0.7), light_direction([-59.3, 0.7, 33.7]), atol=1e-15
-    )
 
 
 def test_directions_of_a_wrong_shape_are_refused() -> None:

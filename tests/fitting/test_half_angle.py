@@ -156,6 +156,9 @@ def test_what_the_rigs_cameras_see() -> None:
 def test_shapes_are_checked() -> None:
     one = to_half_angles([0.0, 0.0, 1.0], directions(4, 9))
     assert one.theta_h.shape == (4,)
+    for wrong in ([0.0, 0.0, 2.0], [0.0, np.nan, 1.0]):
+        with pytest.raises(ValueError, match=r"view direction 0 = .* is no unit vector"):
+            to_half_angles(directions(3, 1), wrong)
     with pytest.raises(ValueError, match="3 light directions but 4 view"):
         to_half_angles(directions(3, 1), directions(4, 1))
     with pytest.raises(ValueError, match=r"view directions have shape \(2, 2\)"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tests.paths import CALIBRATION_FILE
 from tvbrdf_fitting.geometry import light_direction
 from tvbrdf_fitting.measurement.calibration import Calibration, load_calibration
 from tvbrdf_fitting.measurement.light_grid import (
@@ -21,13 +21,12 @@ from tvbrdf_fitting.measurement.light_grid import (
 )
 from tvbrdf_fitting.measurement.scan_merge import ScanObservations
 
-FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
 FloatArray = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    return load_calibration(FILE)
+    return load_calibration(CALIBRATION_FILE)
 
 
 def test_counts_of_positions(calibration: Calibration) -> None:

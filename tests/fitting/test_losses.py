@@ -11,17 +11,14 @@ from scipy.integrate import quad
 from scipy.optimize import least_squares
 from scipy.stats import binomtest, norm
 
+from tests.fitting.scans import METAL, SATIN, Simulate
 from tvbrdf_fitting import Observations, fit_scan, get_model
 from tvbrdf_fitting.fit import METRICS, SOLVERS
 from tvbrdf_fitting.problem import make_problem
 from tvbrdf_fitting.solve import losses
 from tvbrdf_fitting.solve.losses import CAUCHY, HUBER, LOSSES
 
-Simulate = Callable[..., Observations]
-
-SATIN = [0.3, 0.5, 0.7, 0.4, 0.8, 6.0]
 COLOURED = "oren_nayar+torrance_sparrow(coloured)"
-METAL = [0.05, 0.06, 0.08, 0.3, 0.5, 1.5, 3.0, 9.0]
 ROBUST = ("huber", "cauchy")
 
 

@@ -10,17 +10,14 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from tests.fitting.scans import METAL, SATIN, Simulate
 from tvbrdf_fitting import FitError, FitResult, Observations, fit_scan, get_model
 from tvbrdf_fitting.error_measures import LOG_LARGEST_ANGLE_DEG, LOG_SMALLEST_VALUE
 from tvbrdf_fitting.fit import METRICS, SOLVERS
 from tvbrdf_fitting.problem import Problem, make_problem
 
-Simulate = Callable[..., Observations]
-
 COLOURED = "oren_nayar+torrance_sparrow(coloured)"
-METAL = [0.05, 0.06, 0.08, 0.3, 0.5, 1.5, 3.0, 9.0]
 """One Ks for all channels, which the default model has, cannot explain it."""
-SATIN = [0.3, 0.5, 0.7, 0.4, 0.8, 6.0]
 GLOSSY = [0.05, 0.12, 0.4, 0.2, 3.0, 25.0]
 
 

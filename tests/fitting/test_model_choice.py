@@ -61,6 +61,14 @@ def check(choice: ModelChoice) -> None:
     assert kept[0].parameters == len(choice.result.values) - len(choice.result.fixed)
     assert choice.solve_time_s == pytest.approx(sum(r.solve_time_s for r in choice.rungs))
     assert 1 <= choice.effective_values <= choice.values
+    assert choice.weights[choice.model] == max(choice.weights.values())
+    assert sum(choice.weights.values()) == pytest.approx(1.0)
+    for name, deviation in zip(
+        choice.result.parameter_names, choice.standard_deviations, strict=True
+    ):
+        stated = choice.result.standard_deviation(name)
+        assert np.isfinite(deviation) == np.isfinite(stated)
+        assert (deviation == 0) == (stated == 0)
 
 
 def specular(model: str) -> bool:
@@ -222,8 +230,8 @@ class TestSimulatedTruth:
 
 class TestCost:
     def test_climb_is_short(self, simulate: Simulate) -> None:
-        """What is explained and shows no structure is tried with one more effect only."""
-        for name, most in (("matte", 3), ("rough", 4), ("satin", 5), ("coloured", 6)):
+        """Explained and without structure: one more effect, or another shape of lobe, is tried."""
+        for name, most in (("matte", 3), ("rough", 4), ("satin", 6), ("coloured", 7)):
             model, values = TRUTHS[name]
             choice = choose(simulate(values, model, noise=0.01, step=6, seed=1))
             assert len(choice.rungs) <= most, [rung.model for rung in choice.rungs]

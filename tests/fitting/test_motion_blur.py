@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tvbrdf_fitting.measurement.motion_blur import second_derivative, without_motion_blur
-from tvbrdf_fitting.measurement.scan_merge import SweepObservations
+from tvbrdf_fitting.measurement.sweep_merge import SweepObservations
 
 STEP_DEG = 0.5
 ARC_DEG = 0.48

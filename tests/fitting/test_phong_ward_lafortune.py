@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from tests.fitting.conftest import Simulate
+from tests.fitting.scans import Simulate
 from tvbrdf_fitting.fit import FitError, fit_scan
 from tvbrdf_fitting.geometry import (
     CAMERA_ANGLES_DEG,
     FloatArray,
     light_direction,
-    turned_in_light_plane,
     view_direction,
 )
 from tvbrdf_fitting.models import get_model
@@ -291,7 +290,7 @@ class TestRefusal:
         spread = self.lights + [0, 1, 0] * np.deg2rad(rng.uniform(-3.3, 3.3, (50, 1)))
         in_one_plane = {
             "turned about the normal": self.lights @ turn.T,
-            "turned in the plane": turned_in_light_plane(self.lights, -5.0),
+            "turned in the plane": light_direction(np.linspace(-82.0, 84.0, 50)),
             "spread of the near field": spread / np.linalg.norm(spread, axis=1)[:, None],
             "one direction": np.repeat(self.lights[:1], 9, axis=0),
             "the normal": np.repeat(NORMAL[None, :], 9, axis=0),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from tests.fitting.hard_directions import direction, every, hard_directions
 from tests.fitting.precision import (
     Number,
     Terms,
@@ -15,9 +16,6 @@ from tests.fitting.precision import (
     angles,
     check_jacobian,
     check_value,
-    direction,
-    every,
-    hard_directions,
     mp,
     mpf,
 )

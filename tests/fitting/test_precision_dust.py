@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.fitting.hard_directions import every, ordinary_directions
 from tests.fitting.precision import (
     Number,
     Terms,
@@ -11,11 +12,9 @@ from tests.fitting.precision import (
     angles,
     check_jacobian,
     check_value,
-    every,
     float32_cost,
     mp,
     mpf,
-    ordinary_directions,
 )
 from tests.fitting.test_precision_oren_nayar import lambert, oren_nayar
 from tests.fitting.test_precision_torrance_sparrow import torrance_sparrow

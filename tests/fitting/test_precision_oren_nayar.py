@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.fitting.hard_directions import every, hard_directions, ordinary_directions
 from tests.fitting.precision import (
     EPS,
     LIMIT_EPS,
@@ -16,12 +17,9 @@ from tests.fitting.precision import (
     angles,
     check_jacobian,
     check_value,
-    every,
     float32_cost,
-    hard_directions,
     mp,
     mpf,
-    ordinary_directions,
 )
 from tvbrdf_fitting.geometry import FloatArray
 from tvbrdf_fitting.models import get_model

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from tests.fitting.hard_directions import direction, every, hard_directions
 from tests.fitting.precision import (
     Number,
     Terms,
@@ -14,10 +15,7 @@ from tests.fitting.precision import (
     angles,
     check_jacobian,
     check_value,
-    direction,
-    every,
     float32_cost,
-    hard_directions,
     mp,
     mpf,
 )

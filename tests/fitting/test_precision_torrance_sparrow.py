@@ -5,16 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.fitting.hard_directions import direction, every, hard_directions
 from tests.fitting.precision import (
     Number,
     Vector,
     angles,
     check_jacobian,
     check_value,
-    direction,
-    every,
     float32_cost,
-    hard_directions,
     mp,
 )
 from tvbrdf_fitting.geometry import FloatArray

@@ -19,10 +19,10 @@ from tvbrdf_fitting.published import (
     parse_scan_file_name,
     read_scan,
     read_scan_file,
+    scan_file,
     scan_file_name,
     write_scan_file,
 )
-from tvbrdf_fitting.published import scan as published_scan
 
 HALF_MICRO = 0.5e-6 * (1 + 1e-9)
 """Rounding to 6 decimals."""
@@ -66,9 +66,9 @@ def test_real_files_have_the_rigs_geometry(shared_data: Path) -> None:
 def test_fast_and_line_by_line_parsers_agree_exactly(shared_data: Path) -> None:
     for path in real_scan_files(shared_data)[::10]:
         body = path.read_bytes().split(b"\n", 1)[1]
-        fast = published_scan._parse_canonical(body)
+        fast = scan_file._parse_canonical(body)
         assert fast is not None
-        slow = published_scan._parse_lines(body, path)
+        slow = scan_file._parse_lines(body, path)
         np.testing.assert_array_equal(fast, slow)
         np.testing.assert_array_equal(np.signbit(fast), np.signbit(slow))
 
@@ -94,9 +94,9 @@ def test_reading_inverts_writing(
     )
     text = format_scan_file(written)
     body = text.split(b"\n", 1)[1]
-    parsed = published_scan._parse_canonical(body)
+    parsed = scan_file._parse_canonical(body)
     assert parsed is not None
-    np.testing.assert_array_equal(parsed, published_scan._parse_lines(body, Path("x")))
+    np.testing.assert_array_equal(parsed, scan_file._parse_lines(body, Path("x")))
     # 1e8 with 6 decimals has 15 digits: a double's own rounding adds its spacing there, 1.5e-8
     np.testing.assert_allclose(parsed[:, 0], written.radiance, rtol=0, atol=HALF_MICRO + 1.5e-8)
     np.testing.assert_allclose(parsed[:, 1], written.light_direction, rtol=0, atol=HALF_MICRO)
@@ -195,9 +195,9 @@ def test_damaged_bytes_never_give_anything_but_valid_data_or_an_error(data: st.D
     for _ in range(data.draw(st.integers(1, 4))):
         whole[data.draw(st.integers(40, len(whole) - 1))] = data.draw(st.integers(0, 255))
     body = bytes(whole).split(b"\n", 1)[1]
-    fast = published_scan._parse_canonical(body)
+    fast = scan_file._parse_canonical(body)
     try:
-        slow: NDArray[np.float64] | None = published_scan._parse_lines(body, Path("x"))
+        slow: NDArray[np.float64] | None = scan_file._parse_lines(body, Path("x"))
     except PublishedFormatError:
         slow = None
     if fast is not None:  # the fast parser accepts nothing that the strict one refuses

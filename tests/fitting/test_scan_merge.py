@@ -10,23 +10,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.paths import CALIBRATION_FILE
 from tvbrdf_fitting.geometry import light_world_angle_deg
 from tvbrdf_fitting.measurement.calibration import Calibration, CameraCalibration, load_calibration
 from tvbrdf_fitting.measurement.clock_model import fit_clock, frame_stamps
 from tvbrdf_fitting.measurement.frame_reduction import FrameReducer
 from tvbrdf_fitting.measurement.light_grid import merge_on_grid
 from tvbrdf_fitting.measurement.light_path import LightPath
-from tvbrdf_fitting.measurement.scan_merge import (
+from tvbrdf_fitting.measurement.scan_merge import ScanObservations, assemble_scan
+from tvbrdf_fitting.measurement.sweep_merge import (
     FrameRecord,
-    ScanObservations,
     SweepObservations,
-    assemble_scan,
     sweep_observations,
 )
-from tvbrdf_fitting.published.scan import read_scan_file, scan_file_name
+from tvbrdf_fitting.published import read_scan_file, scan_file_name
 
-FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
-CALIBRATION = load_calibration(FILE)
+CALIBRATION = load_calibration(CALIBRATION_FILE)
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.paths import CALIBRATION_FILE
 from tvbrdf_fitting.measurement.calibration import load_calibration
 from tvbrdf_fitting.measurement.frame_reduction import PatchStatistics, RegionStatistics
 from tvbrdf_fitting.measurement.light_path import LightPath
@@ -17,10 +17,13 @@ from tvbrdf_fitting.measurement.radiometry import (
     lamp_factor,
     region_radiance,
 )
-from tvbrdf_fitting.measurement.scan_merge import FrameRecord, SweepObservations, sweep_observations
+from tvbrdf_fitting.measurement.sweep_merge import (
+    FrameRecord,
+    SweepObservations,
+    sweep_observations,
+)
 
-FILE = Path(__file__).resolve().parents[2] / "launch" / "calibration.yaml"
-CALIBRATION = load_calibration(FILE)
+CALIBRATION = load_calibration(CALIBRATION_FILE)
 
 
 def region(mean_dn: float, *, pixels: int = 10_000, saturated: int = 0) -> RegionStatistics:

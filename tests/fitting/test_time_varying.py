@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tvbrdf_fitting import Observations, fit_scan, get_model
+from tests.fitting.scans import Simulate
+from tvbrdf_fitting import fit_scan, get_model
 from tvbrdf_fitting.geometry import light_direction, view_direction
 from tvbrdf_fitting.time_varying import (
     KINDS,
@@ -159,7 +159,7 @@ class TestSettlingDust:
 @pytest.mark.parametrize("material", [PAINT, CLOTH, DUST], ids=lambda m: m.kind)
 @pytest.mark.parametrize("time_s", [0.0, 240.0])
 def test_a_fit_finds_the_material_again(
-    simulate: Callable[..., Observations], material: TimeVaryingMaterial, time_s: float
+    simulate: Simulate, material: TimeVaryingMaterial, time_s: float
 ) -> None:
     truth = list(material.parameters_at(time_s).values())
     result = fit_scan(simulate(truth, material.model, step=3), material.model)

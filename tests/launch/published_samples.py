@@ -8,21 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from tests import rig_scans
 from tvbrdf_fitting import Observations
-from tvbrdf_fitting.geometry import above_horizon, light_direction, view_direction
-from tvbrdf_fitting.models import SURFACE, get_model
-from tvbrdf_fitting.published import CameraScan, scan_file_name, write_parameters, write_scan_file
+from tvbrdf_fitting.published import scan_file_name, write_parameters, write_scan_file
 from tvbrdf_launch.cli import main
 
-EXPOSURES_MS = (0.2, 4.0, 32.0)
+EXPOSURES_MS = rig_scans.EXPOSURES_MS
 NAMES = ("kd_b", "kd_g", "kd_r", "sigma_d", "ks", "inverse_sigma_s")
 PAINT = (0.08, 0.2, 0.45, 0.3, 0.6, 9.0)
 START_NS = 1_769_851_800_000_000_000
-NOISE = 0.005
 
 
 @dataclass
@@ -65,44 +62,11 @@ def fit_with(capsys: pytest.CaptureFixture[str]) -> Fit:
 
 
 def observe(truth: tuple[float, ...] = PAINT, seed: int = 1) -> Observations:
-    """What the rig sees every degree, with shot noise that the variances state."""
-    rng = np.random.default_rng(seed)
-    world = np.linspace(-90.0, 90.0, 181)
-    light = light_direction(world)
-    parts = []
-    for camera, angle in enumerate((0.0, 25.0, 50.0, 75.0), start=1):
-        keep = above_horizon(light) & ((camera > 1) | (np.abs(world) > 1.6))
-        n = int(keep.sum())
-        view = np.tile(view_direction(angle), (n, 1))
-        clean = np.pi * light[keep][:, 2:] * get_model(SURFACE).evaluate(light[keep], view, truth)
-        deviation = NOISE * np.sqrt(0.02 + clean)
-        parts.append(
-            Observations(
-                light_direction=light[keep],
-                view_direction=view,
-                radiance=clean + deviation * rng.standard_normal((n, 3)),
-                variance=deviation**2,
-                valid=np.ones((n, 3), dtype=bool),
-                camera=np.full(n, camera),
-                sweep=np.zeros(n, dtype=int),
-                exposure_ms=np.full(n, 4.0),
-                time_s=np.zeros(n),
-            )
-        )
-    return Observations.concatenate(parts)
+    """What the rig sees every degree."""
+    return rig_scans.observe(truth, seed=seed, lights=181)
 
 
-def grid_of(observations: Observations) -> dict[int, CameraScan]:
-    grid = {}
-    for camera in (1, 2, 3, 4):
-        rows = observations.camera == camera
-        grid[camera] = CameraScan(
-            EXPOSURES_MS,
-            observations.light_direction[rows],
-            observations.view_direction[rows][0],
-            observations.radiance[rows],
-        )
-    return grid
+grid_of = rig_scans.grid_of
 
 
 def truth_of(scan: int) -> tuple[float, ...]:

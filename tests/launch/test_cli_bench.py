@@ -30,7 +30,6 @@ from tvbrdf_launch.errors import RunError
 
 SATIN = (0.3, 0.5, 0.7, 0.4, 0.8, 6.0)
 MODEL = get_model(SURFACE)
-TRUTH = MODEL.to_internal(SATIN)
 SMALL = grid.Plan(
     lights=(24, 96),
     cameras=(1, 4),
@@ -208,6 +207,18 @@ def test_of_equals_the_faster_needs_few_images(cells: list[Cell]) -> None:
     assert [marked[name].few for name in (one.solver, "slow", "exact")] == [False, False, True]
 
 
+def test_the_table_marks_the_front_of_every_solver(cells: list[Cell]) -> None:
+    slow = [replace(c, time_ms=9.0) for c in cells]
+    quick = [replace(c, solver="quick", time_ms=1.0) for c in cells if c.solver == "separable"]
+    text = table.as_text(grid.mark_fronts([*slow, *quick]))
+    rows = [line for line in text.splitlines() if line.split()[:1] in (["24"], ["96"])]
+    timed = [line for line in rows if " 9" in line and "/" not in line]
+    assert len(timed) == 2 * 2
+    # all three take 9 ms and the last column 1 ms, with the errors of the first
+    assert not any(" 9 t" in line for line in timed)
+    assert any(line.rstrip().endswith("1 tn") for line in timed)
+
+
 def test_what_is_not_a_number_is_the_worst() -> None:
     values = np.array([1.0, math.nan, 2.0, 3.0])
     assert grid._quantile(values, 0.5) == 2.0
@@ -264,6 +275,9 @@ def test_a_missing_or_broken_sample_is_one_line(sample: Path, tmp_path: Path) ->
         run(str(sample), "--scan", "9")
     with pytest.raises(RunError, match="--scan needs the PATH"):
         run("--scan", "1")
+    (tmp_path / "taken").touch()
+    with pytest.raises(FileExistsError):  # at once: the whole plan takes minutes
+        run("--out", str(tmp_path / "taken"))
     path = sample / "tvBrdf-data" / scan_file_name(1, 3)
     path.write_text(path.read_text()[:-20])
     with pytest.raises(RunError, match=r"camera3.* is truncated"):

@@ -265,6 +265,27 @@ def test_kept_frames_are_fitted_as_the_fitter_does(fit: Fit, database: Path) -> 
     assert {scan["source"] for scan in grid["scans"]} == {"grid"}
 
 
+@pytest.mark.parametrize("scan_by_scan", [[], ["--scan-by-scan"]], ids=["joint", "per scan"])
+def test_each_scans_own_common_errors_are_used(
+    fit: Fit, database: Path, scan_by_scan: list[str]
+) -> None:
+    """The second scan's light is known worse than the first's: so says its own file."""
+    path = database / "sample01" / "observations" / "scan02.npz"
+    with np.load(path) as arrays:
+        changed = {name: arrays[name] for name in arrays.files}
+    np.savez(path, **changed | {"light_angle_std_deg": np.array([0.5])})
+    words = ["--model", "auto", "--no-pictures", "--json", *scan_by_scan]
+    for scan, light_std_deg in zip(
+        fit(database, *words).json()["samples"][0]["scans"], (0.02, 0.5), strict=True
+    ):
+        common = CommonErrors({0: light_std_deg}, 0.002, dict.fromkeys((1, 2, 3, 4), 0.001))
+        scene = observe(truth_of(scan["scan"]), seed=scan["scan"])
+        expected = fit_scan(scene, scan["fit"]["model"], common_errors=common)
+        assert scan["fit"]["values"] == pytest.approx(expected.values.tolist(), rel=1e-12)
+        found = scan["fit"]["nuisances"]["light_offset_sweep0_deg"]
+        assert found == pytest.approx(expected.nuisances["light_offset_sweep0_deg"], rel=1e-9)
+
+
 def test_frames_that_cannot_be_read_are_an_error(fit: Fit, database: Path) -> None:
     path = database / "sample01" / "observations" / "scan02.npz"
     path.write_bytes(path.read_bytes()[:2000])

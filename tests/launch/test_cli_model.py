@@ -111,6 +111,18 @@ def test_check_of_a_good_model(capsys: pytest.CaptureFixture[str]) -> None:
     assert text.endswith("\ngood\n")
 
 
+def test_check_tells_numbers_of_any_size(capsys: pytest.CaptureFixture[str]) -> None:
+    text = told(capsys, "check", "lambert", "kd:=1e-9", "kd_r:=1e200", "--angle", "0", status=1)
+    assert re.search(r"^0 +1\.0000000e-09 +1\.0000000e-09 +1\.0000000e\+200 ", text, re.M)
+    assert "Largest albedo: B 1.0000e-09, G 1.0000e-09, R 1.0000e+200" in text
+
+
+def test_check_outside_the_bounds_is_not_good(capsys: pytest.CaptureFixture[str]) -> None:
+    text = told(capsys, "check", "ON+TS", "ks:=-1", "--tolerance", "1e-3", status=1)
+    assert "! ks = -1 lies outside its bounds 0 to inf" in text
+    assert text.endswith("\nnot good\n")
+
+
 def test_check_of_one_that_creates_energy(capsys: pytest.CaptureFixture[str]) -> None:
     words = ("oren_nayar", "kd:=0.5", "--angle", "75", "kd_r:=1", "sigma_d:=0.3")
     text = told(capsys, "check", *words, status=1)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from matplotlib.text import Text
 
+from tests.rendering.labels import texts_on_the_page
 from tvbrdf_fitting import FitResult, Observations, fit_scan, get_model
 from tvbrdf_fitting.choice.choose import choose_model
 from tvbrdf_fitting.design.fisher_information import Rig
@@ -27,7 +25,6 @@ from tvbrdf_rendering.blind_map import (
 )
 
 SATIN = [0.30, 0.50, 0.70, 0.40, 0.80, 6.0]
-Observe = Callable[..., Observations]
 
 
 def observe(
@@ -60,19 +57,7 @@ def found(fit: FitResult, scan: Observations) -> BlindMap:
 
 
 def texts(figure: Figure) -> list[str]:
-    """All texts, after a check that those drawn lie within the figure."""
-    canvas = figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    renderer = canvas.get_renderer()  # type: ignore[no-untyped-call]
-    shown = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip()]
-    for text in shown:
-        box = text.get_window_extent(renderer)
-        assert box.x0 > -1, text
-        assert box.y0 > -1, text
-        assert box.x1 < figure.bbox.x1 + 1, text
-        assert box.y1 < figure.bbox.y1 + 1, text
-    return [text.get_text() for text in shown]
+    return [text for text, _ in texts_on_the_page(figure)]
 
 
 def test_the_numbers_are_the_predictions(found: BlindMap, fit: FitResult) -> None:

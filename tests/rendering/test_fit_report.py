@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from tests.rendering.test_report import check_labels
+from tests.rendering.labels import check_labels
+from tests.rig_scans import deviation, observe
 from tvbrdf_fitting import FitResult, Observations, fit_scan
 from tvbrdf_fitting.choice.choose import choose_model
-from tvbrdf_fitting.geometry import above_horizon, light_direction, view_direction
 from tvbrdf_fitting.models import SURFACE, get_model
 from tvbrdf_rendering.fit_curves import camera_curves, fit_curves_figure, residuals
 from tvbrdf_rendering.fit_report import (
@@ -30,43 +30,11 @@ from tvbrdf_rendering.lobe import in_plane, lobe_amplitudes, lobe_figure, lobes
 
 PAINT = (0.08, 0.2, 0.45, 0.3, 0.6, 9.0)
 GLOSS = (0.02, 0.02, 0.03, 0.0, 20.0, 15.0)
-NOISE = 0.005
-
-
-def observe(
-    truth: tuple[float, ...] = PAINT, *, model: str = SURFACE, seed: int = 1, sweeps: int = 1
-) -> Observations:
-    """What the rig sees of a material, with stated noise and the arm's gap in camera 1."""
-    rng = np.random.default_rng(seed)
-    world = np.linspace(-90.0, 90.0, 361)
-    light = light_direction(world)
-    parts = []
-    for sweep in range(1, sweeps + 1):
-        for camera, angle in enumerate((0.0, 25.0, 50.0, 75.0), start=1):
-            keep = above_horizon(light) & ((camera > 1) | (np.abs(world) > 1.6))
-            n = int(keep.sum())
-            view = np.tile(view_direction(angle), (n, 1))
-            clean = np.pi * light[keep][:, 2:] * get_model(model).evaluate(light[keep], view, truth)
-            deviation = NOISE * np.sqrt(0.02 + clean)
-            parts.append(
-                Observations(
-                    light_direction=light[keep],
-                    view_direction=view,
-                    radiance=clean + deviation * rng.standard_normal((n, 3)),
-                    variance=deviation**2,
-                    valid=np.ones((n, 3), dtype=bool),
-                    camera=np.full(n, camera),
-                    sweep=np.full(n, sweep),
-                    exposure_ms=np.full(n, 4.0),
-                    time_s=np.zeros(n),
-                )
-            )
-    return Observations.concatenate(parts)
 
 
 @pytest.fixture(scope="module")
 def paint() -> tuple[Observations, FitResult]:
-    observations = observe()
+    observations = observe(PAINT)
     return observations, fit_scan(observations)
 
 
@@ -124,8 +92,8 @@ def test_curves_are_what_was_measured_and_fitted(paint: tuple[Observations, FitR
         )
         np.testing.assert_allclose(between, curve.fitted, atol=2e-4 * expected.max())
         # 5 deviations of 4000 values
-        deviation = np.sqrt(observations.variance[rows])
-        assert (np.abs(residuals(curve, logarithmic=False)) < 5 * deviation).all()
+        noise = np.sqrt(observations.variance[rows])
+        assert (np.abs(residuals(curve, logarithmic=False)) < 5 * noise).all()
 
 
 def test_the_axis_is_the_lights_world_angle(paint: tuple[Observations, FitResult]) -> None:
@@ -213,9 +181,9 @@ def test_the_lobe_is_the_fitted_brdf(paint: tuple[Observations, FitResult]) -> N
         seen = lobe.measured[0]
         at = fit.brdf(in_plane(lobe.standing_deg), in_plane(-12.0))[0]
         cosine = np.cos(np.deg2rad(lobe.standing_deg))
-        deviation = NOISE * np.sqrt(0.02 + np.pi * cosine * at) / (np.pi * cosine)
+        noise = deviation(np.pi * cosine * at) / (np.pi * cosine)
         # the values are up to half a degree apart, over which the lobe changes by 1 per cent
-        assert (np.abs(seen - at) < 5 * deviation + 0.01 * at).all()
+        assert (np.abs(seen - at) < 5 * noise + 0.01 * at).all()
 
 
 def test_parts_of_the_lobe_are_the_models(paint: tuple[Observations, FitResult]) -> None:

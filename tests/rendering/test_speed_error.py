@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from matplotlib.text import Text
 
+from tests.rendering.labels import texts_on_the_page
 from tvbrdf_rendering.speed_error import plot_speed_error, speed_error_figure
 
 
@@ -61,17 +60,7 @@ def test_all_is_drawn_and_all_texts_are_on_the_page(noises: tuple[float | None, 
     figure = speed_error_figure(cells, title="sample07, scan 3, against the fit of all of it")
     assert len(figure.axes) == 2 * len(noises)
     assert drawn_points(figure) == len(cells)
-    canvas = figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    page, words = figure.bbox, set()
-    for legend in figure.legends:
-        for text in legend.findobj(Text):
-            assert isinstance(text, Text)
-            box = text.get_window_extent()
-            assert page.x0 <= box.x0 <= box.x1 <= page.x1, text.get_text()
-            assert page.y0 <= box.y0 <= box.y1 <= page.y1, text.get_text()
-            words.add(text.get_text())
+    words = {text for text, _ in texts_on_the_page(figure)}
     assert {"separable", "paper", "scipy lm", "somebody's", "4 cameras"} <= words
     numbers = {text.get_text() for axes in figure.axes for text in axes.texts}
     assert numbers == {"12", "48", "361"}

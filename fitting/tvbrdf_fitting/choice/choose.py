@@ -13,23 +13,24 @@ parameters: ``sum of squares / tau + k ln(n / tau)``, the squares in deviations 
 *Rule.* The simplest rung that none beats, see `model_rule`.
 
 *Climb.* The ladder is a graph: from its first rung on, the neighbours of the rung that would be
-kept are fitted one after the other, simpler ones first, until it has none left; where no rung
-explains the data, those of the rung with the least error too, if that gives a hint of what matters.
-Where one explains them and leaves residuals without structure, only richer neighbours with one more
-effect are fitted, not those with another shape of lobe or with one more lobe and its colours.
+kept are fitted one after the other, simpler ones first, until it has none left; where residuals
+have structure those of the rung with the least error too, if no rung explains the data only where
+that gives a hint of what matters. Where one explains them and leaves residuals without structure,
+only neighbours with one more effect or another shape of lobe are fitted, not those with one more
+lobe and its colours.
+
+*Uncertainty.* What the choice adds to that of the kept fit's parameters: `spread`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 from ..inference.nuisances import CommonErrors
 from ..observations import Observations
 from ..problem import FitError
-from ..result import FitResult
 from .ladder import (
     DEFAULT_LADDER,
     EXPLAINED,
@@ -41,107 +42,16 @@ from .ladder import (
     as_ladder,
     find,
 )
+from .model_choice import ModelChoice, Rung
 from .rule import Comparison, Standing, Verdict
+from .spread import deviations_over, weights_of
 
 _STRUCTURELESS = 4.5
-"""Largest mean of a block in its deviations; of some 10 000 blocks of noise 1 in 15 goes beyond."""
+"""Largest mean of a block in its deviations: of 600 fits of the true model 1 in 150 is beyond."""
+_INDEPENDENT = 1.5
+"""Largest number of values that count as one: of 600 fits of the true model 1.38."""
 _ONE_EFFECT = 2
 """Largest number of parameters that a roughness, a lobe, or its colours add."""
-
-
-@dataclass(frozen=True)
-class Rung:
-    """One model of the ladder and why it was kept or not.
-
-    Attributes
-    ----------
-    model
-        Its name, with what was held; `previous` takes it.
-    parameters
-        Number of free parameters.
-    rejected
-        Why it was not kept; empty for the kept one.
-    chi_square, degrees_of_freedom, model_error_std
-        Of its fit, at the stated variances.
-    noise
-        Root mean square of its residuals in stated deviations: the noise it would need.
-    criterion
-        As in the module's header; of a jointly chosen series the sum over scans.
-    error
-        Root mean square of its residuals, in deviations of the errors estimated for all rungs.
-    highlight
-        Share of its most distinct lobe that diffuse parts can't make; infinite without lobes, NaN
-        where a rung explains the data, so that it does not count.
-    undetermined
-        Parameters that the data do not determine.
-    explains
-        Whether noise explains what it leaves: `noise` squared is at most `EXPLAINED`.
-    solve_time_s
-        Cost of its fit.
-    """
-
-    model: str
-    parameters: int
-    rejected: str
-    chi_square: float = math.nan
-    degrees_of_freedom: int = 0
-    model_error_std: float = math.nan
-    noise: float = math.nan
-    criterion: float = math.nan
-    error: float = math.nan
-    highlight: float = math.nan
-    undetermined: tuple[str, ...] = ()
-    explains: bool = False
-    solve_time_s: float = 0.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything as plain Python types, numbers that are not finite as None (valid JSON)."""
-        plain = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return {
-            name: None if isinstance(v, float) and not math.isfinite(v) else v
-            for name, v in plain.items()
-        } | {"undetermined": list(self.undetermined)}
-
-
-@dataclass(frozen=True, eq=False)
-class ModelChoice:
-    """The fit that was kept, and why.
-
-    Attributes
-    ----------
-    result
-        The kept fit.
-    model
-        Its rung's name, with what was held; what `previous` takes.
-    reason
-        In words.
-    rungs
-        Every rung fitted, in the order of the climb.
-    values, effective_values
-        Number of values, and how many independent ones they are worth.
-    solve_time_s
-        Of all rungs.
-    """
-
-    result: FitResult
-    model: str
-    reason: str
-    rungs: tuple[Rung, ...]
-    values: int
-    effective_values: float
-    solve_time_s: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything as plain Python types, numbers that are not finite as None (valid JSON)."""
-        return {
-            "model": self.model,
-            "reason": self.reason,
-            "values": self.values,
-            "effective_values": self.effective_values,
-            "solve_time_s": self.solve_time_s,
-            "rungs": [rung.as_dict() for rung in self.rungs],
-            "result": self.result.as_dict(),
-        }
 
 
 def choose_model(
@@ -189,7 +99,7 @@ def choose_for_series(
     metric: str = "radiance",
     loss: str = "least_squares",
     method: str | None = None,
-    common_errors: CommonErrors | None = None,
+    common_errors: CommonErrors | Sequence[CommonErrors | None] | None = None,
 ) -> list[ModelChoice]:
     """Choose models for a time series.
 
@@ -202,30 +112,48 @@ def choose_for_series(
         scan to scan, also where a lobe fades until it is `undetermined`. A rung is determined, and
         has a highlight, if it is so in any scan. "per_scan": scan by scan, each with the one
         before as `previous`: for scans as they come, and for samples that become another material.
-    ladder, metric, loss, method, common_errors
+    ladder, metric, loss, method
         As for `choose_model`.
+    common_errors
+        As for `choose_model`: of all scans, or a sequence with those of each. Their priors differ
+        from scan to scan where light offsets and lamp drift were estimated scan by scan.
 
     Raises
     ------
     FitError
         No rung can be fitted; for "joint", none to all scans.
     ValueError
-        Unknown mode or models, or no scans.
+        Unknown mode or models, no scans, or not as many common errors as scans.
     """
     if mode not in {"joint", "per_scan"}:
         raise ValueError(f"unknown mode {mode!r}; known modes: joint, per_scan")
     if not scans:
         raise ValueError("no scans to choose a model for")
     rungs, start = _ladder(ladder)
-    options = _options(metric, loss, method, common_errors)
+    series = [
+        Scan(scan, _options(metric, loss, method, common))
+        for scan, common in zip(scans, _of_each(common_errors, len(scans)), strict=True)
+    ]
     if mode == "joint":
-        return _choose([Scan(scan, options) for scan in scans], rungs, start, None)
+        return _choose(series, rungs, start, None)
     choices: list[ModelChoice] = []
     previous: Candidate | None = None
-    for scan in scans:
-        choices += _choose([Scan(scan, options)], rungs, start, previous)
+    for one in series:
+        choices += _choose([one], rungs, start, previous)
         previous = find(rungs, choices[-1].model)
     return choices
+
+
+def _of_each(
+    common: CommonErrors | Sequence[CommonErrors | None] | None, scans: int
+) -> Sequence[CommonErrors | None]:
+    if common is None or isinstance(common, CommonErrors):
+        return [common] * scans
+    if len(common) != scans:
+        raise ValueError(
+            f"common errors of {len(common)} scans for {scans}: give one for all, or one a scan"
+        )
+    return common
 
 
 def _options(
@@ -283,11 +211,18 @@ def _next(
     if waiting:
         return waiting
     waiting = [c for c in ladder[here] if c not in tried]
-    if not all(w.explained for w in weighings):
-        return waiting + [c for c in ladder[further.candidate] if c not in tried]
-    if all(w.largest < _STRUCTURELESS for w in weighings):
-        return [c for c in waiting if 0 < c.size - here.size <= _ONE_EFFECT]
-    return waiting
+    if all(map(_structureless, weighings)):
+        return [c for c in waiting if 0 <= c.size - here.size <= _ONE_EFFECT]
+    return waiting + [c for c in ladder[further.candidate] if c not in tried]
+
+
+def _structureless(weighing: Weighing) -> bool:
+    """Whether noise explains a scan, and nothing else can be seen in what is left."""
+    return (
+        weighing.explained
+        and weighing.largest < _STRUCTURELESS
+        and weighing.correlated < _INDEPENDENT
+    )
 
 
 def _compared(
@@ -319,11 +254,19 @@ def _report(scan: Scan, weighing: Weighing, verdict: Verdict, scans: int) -> Mod
         for c, trial in scan.trials.items()
     )
     kept = scan.trials[verdict.kept.candidate]
+    weights = weights_of(
+        {s.candidate.label: s.criterion - verdict.kept.criterion for s in verdict.standings}
+    )
+    fits = {c.label: trial.fit for c, trial in scan.fitted.items()}
+    internal, published = deviations_over(kept.fit, fits, weights)
     return ModelChoice(
         result=kept.fit,
         model=kept.candidate.label,
         reason=_reason(scan, kept, weighing, verdict, scans),
         rungs=rungs,
+        standard_deviations=published,
+        internal_deviations=internal,
+        weights=weights,
         values=weighing.values,
         effective_values=weighing.effective_values,
         solve_time_s=sum(rung.solve_time_s for rung in rungs),
@@ -381,3 +324,6 @@ def _reason(scan: Scan, kept: Trial, weighing: Weighing, verdict: Verdict, scans
     if scans > 1:
         parts.append(f"chosen for {scans} scans together, by the sum of their criteria")
     return "; ".join(parts)
+
+
+__all__ = ["ModelChoice", "Rung", "choose_for_series", "choose_model"]

@@ -3,7 +3,9 @@
 A rung beats one with fewer or as many parameters where its criterion is lower by `DECISIVE`
 and, if no rung explains the data within their noise, its root mean square error is smaller by
 `MATTERS`: better fits of what remains wrong must matter in practice. The simplest rung that none
-beats, and that has a lower criterion than every simpler one, is kept. Three guards:
+beats, and that has a lower criterion than every simpler one, is kept. Of rungs with as many
+parameters the ladder's first counts as the simplest where noise explains the data, so that noise
+does not decide on the shape of a lobe; else the one with the lower criterion. Three guards:
 
 - A rung with an undetermined parameter needs twice as much against each simpler one.
 - Where no rung explains the data, a lobe must be a highlight: at least `HIGHLIGHT` of its squared
@@ -66,7 +68,9 @@ class Comparison:
     """The rule, over rungs in the order of their parameters."""
 
     def __init__(self, standings: Sequence[Standing], explained: bool, price: float) -> None:
-        self.standings = sorted(standings, key=lambda s: (s.parameters, s.criterion, s.order))
+        self.standings = sorted(
+            standings, key=lambda s: (s.parameters, 0.0 if explained else s.criterion, s.order)
+        )
         self.explained, self._price = explained, price
 
     def verdict(self, previous: Candidate | None) -> Verdict:
@@ -93,11 +97,7 @@ class Comparison:
             if standing is kept:
                 continue
             simpler = self.standings.index(standing) < self.standings.index(kept)
-            if (
-                simpler
-                and not self._no_highlight(standing)
-                and self._beats(kept, standing, by=DECISIVE, matters=MATTERS)
-            ):
+            if simpler and not self._no_highlight(standing) and self._decides(kept, standing):
                 rejected[standing.candidate] = f"the kept one is {self._better_by(kept, standing)}"
             elif standing.candidate not in rejected:
                 rejected[standing.candidate] = self._no_better(standing, kept)
@@ -106,11 +106,14 @@ class Comparison:
     def further(self, kept: Standing) -> Standing:
         """Return the rung with the least error, if that is a hint of what matters; else the kept.
 
-        A quarter of `MATTERS`: two steps may matter together where neither does. A lobe without a
-        highlight may be one of two steps to a rung that explains the data.
+        Where none explains the data, a quarter of `MATTERS` is a hint: two steps may matter
+        together where neither does. A lobe without a highlight may be one of two steps to a rung
+        that explains the data.
         """
         least = min(self.standings, key=lambda s: s.spread)
-        return least if self._gain(least, kept) >= 0.25 * MATTERS else kept
+        if self.explained or self._gain(least, kept) >= 0.25 * MATTERS:
+            return least
+        return kept
 
     def _allowed(self) -> Sequence[Standing]:
         return [s for s in self.standings if not self._no_highlight(s)] or self.standings
@@ -125,9 +128,7 @@ class Comparison:
                 f"of it ({HIGHLIGHT:.0%} needed where noise does not explain the data)"
             )
         for other in self.standings[: self.standings.index(standing)]:
-            if self._broad(other) and not self._beats(
-                standing, other, by=DECISIVE, matters=MATTERS
-            ):
+            if self._broad(other) and not self._decides(standing, other):
                 return f"its highlight is hardly better than none: {other.candidate.label}"
         return ""
 
@@ -150,11 +151,15 @@ class Comparison:
             self.explained or self._gain(rich, simple) >= matters * factor
         )
 
+    def _decides(self, rich: Standing, simple: Standing) -> bool:
+        """Whether a rung beats one that is not richer."""
+        return self._beats(rich, simple, by=DECISIVE, matters=MATTERS)
+
     def _against(
         self, one: Standing, simpler: Sequence[Standing], richer: Sequence[Standing]
     ) -> str:
         """Why a rung is not to be kept, or nothing."""
-        beaten = [r for r in richer if self._beats(r, one, by=DECISIVE, matters=MATTERS)]
+        beaten = [r for r in richer if self._decides(r, one)]
         if beaten:
             best = min(beaten, key=lambda s: s.criterion)
             return f"{best.candidate.label} is {self._better_by(best, one)}"
@@ -162,7 +167,7 @@ class Comparison:
         if lower:
             return f"no better than {lower[0].candidate.label}"
         if not one.determined:
-            near = [s for s in simpler if not self._beats(one, s, by=DECISIVE, matters=MATTERS)]
+            near = [s for s in simpler if not self._decides(one, s)]
             if near:
                 return f"undetermined, and hardly better than {near[0].candidate.label}"
         return ""

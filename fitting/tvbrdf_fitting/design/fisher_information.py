@@ -17,13 +17,13 @@ lose half of the digits, of which a design needs few.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..geometry import CAMERA_ANGLES_DEG, TILT_DEG, BoolArray, FloatArray
+from ..geometry import CAMERA_ANGLES_DEG, TILT_DEG, BoolArray, FloatArray, IntArray
 from ..geometry import light_direction as light_at
 from ..geometry import view_direction as view_of
 from ..inference.nuisances import CommonErrors, make_nuisances
@@ -61,16 +61,17 @@ class NoiseModel:
 
     electrons_per_radiance_ms: float = 1500.0
     read_noise_e: float = 5.05
-    pixels: int = 14336
+    pixels: float = 14336
     frame_relative_std: float = 0.001
     saturation_radiance_ms: float = 6.667
 
     def __post_init__(self) -> None:
         for part in fields(self):
             value = getattr(self, part.name)
-            above = value >= 0 if part.name == "frame_relative_std" else value > 0
-            if not (math.isfinite(value) and above):
-                raise ValueError(f"noise: {part.name} = {value} must be finite and above 0")
+            may_vanish = part.name == "frame_relative_std"
+            if not (math.isfinite(value) and (value >= 0 if may_vanish else value > 0)):
+                least = "at least" if may_vanish else "above"
+                raise ValueError(f"noise: {part.name} = {value} must be finite and {least} 0")
 
     def own_variance(self, radiance: FloatArray, exposure_ms: FloatArray) -> FloatArray:
         """Variance of photons and read noise (n, 3), of a radiance (n, 3) at exposures (n,)."""
@@ -106,8 +107,8 @@ class Rig:
         Of the plate, in the light's plane.
     sweep_deg
         World angles of the light at the ends of a sweep.
-    hidden_deg
-        Intervals of these angles at which the arm hides the sample, by camera.
+    arm_half_width_deg
+        The arm hides the sample from a camera that lies within this angle of the light.
     sweep_s, frame_rate_hz
         Shortest time of one sweep, and the cameras' rate.
     noise
@@ -117,12 +118,19 @@ class Rig:
     camera_angles_deg: tuple[float, ...] = CAMERA_ANGLES_DEG
     tilt_deg: float = TILT_DEG
     sweep_deg: tuple[float, float] = (-90.0, 90.0)
-    hidden_deg: Mapping[int, Sequence[tuple[float, float]]] = field(
-        default_factory=lambda: {1: ((-1.75, 1.75),)}
-    )
+    arm_half_width_deg: float = 1.75
     sweep_s: float = 12.0
     frame_rate_hz: float = 30.0
     noise: NoiseModel = field(default_factory=NoiseModel)
+
+    def __post_init__(self) -> None:
+        angles = {"tilt_deg": (self.tilt_deg,), "camera_angles_deg": self.camera_angles_deg}
+        for name, values in angles.items():
+            if not all(abs(value) < 90 for value in values):
+                raise ValueError(f"rig: {name} = {[*values]}, expected angles between -90 and 90")
+        low, high = self.sweep_deg
+        if not -math.inf < low < high < math.inf:
+            raise ValueError(f"rig: sweep_deg from {low:g} to {high:g}, expected a rising order")
 
     @property
     def cameras(self) -> tuple[int, ...]:
@@ -138,8 +146,8 @@ class Rig:
         high = min(self.sweep_deg[1], self.tilt_deg + 90.0)
         if not low < high or count < 1:
             raise ValueError(
-                f"no light: sweep {self.sweep_deg} with a tilt of {self.tilt_deg:g} degrees leaves "
-                f"[{low:g}, {high:g}], for {count} lights"
+                f"no light: sweep {self.sweep_deg} with a tilt of {self.tilt_deg:g} degrees, "
+                f"{count} lights"
             )
         return np.asarray(low + (np.arange(count) + phase) * ((high - low) / count))
 
@@ -168,15 +176,17 @@ class Rig:
             No such camera, no light.
         """
         angle = self.lights_deg(lights, phase)
+        every_light = light_at(angle, self.tilt_deg)
+        arm = 2 * math.sin(math.radians(self.arm_half_width_deg) / 2)
         parts = []
         for sweep, exposure in enumerate(exposures_ms, start=1):
             for camera in cameras:
                 if camera not in self.cameras:
                     raise ValueError(f"there is no camera {camera}; there are {self.cameras}")
-                seen = angle[~self._hidden(camera, angle)]
-                light = light_at(seen, self.tilt_deg)
-                angle_deg = self.camera_angles_deg[camera - 1]
-                view = np.broadcast_to(view_of(angle_deg, self.tilt_deg), light.shape)
+                towards = view_of(self.camera_angles_deg[camera - 1], self.tilt_deg)
+                kept = np.linalg.norm(every_light - towards, axis=1) > arm
+                seen, light = angle[kept], every_light[kept]
+                view = np.broadcast_to(towards, light.shape)
                 radiance = np.pi * light[:, 2:] * model.evaluate(light, view, values)
                 exposures = np.full(len(seen), float(exposure))
                 share = (seen - self.sweep_deg[0]) / (self.sweep_deg[1] - self.sweep_deg[0])
@@ -194,12 +204,6 @@ class Rig:
                     )
                 )
         return Observations.concatenate(parts)
-
-    def _hidden(self, camera: int, angle_deg: FloatArray) -> BoolArray:
-        hidden = np.zeros(angle_deg.shape, dtype=bool)
-        for low, high in self.hidden_deg.get(camera, ()):
-            hidden |= (angle_deg >= low) & (angle_deg <= high)
-        return hidden
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +242,7 @@ class Information:
     Raises
     ------
     FitError
-        The rig's directions cannot determine the model.
-    ValueError
-        Unknown names, values outside the model's bounds.
+        The rig's directions cannot determine the model, or values lie outside its bounds.
     """
 
     def __init__(
@@ -258,7 +260,6 @@ class Information:
         self.values = np.asarray(values, dtype=np.float64)
         self.exposures_ms = tuple(float(e) for e in exposures_ms)
         self.internal = self.model.to_internal(self.values)
-        # also checks names and bounds
         everything = dict(self.model.as_mapping(self.values))
         self.fixed = {name: everything[name] for name in fixed}
         flicker = rig.noise.frame_relative_std
@@ -272,7 +273,7 @@ class Information:
         self._reference = reference
         self.free = reference.free
         self._names = make_nuisances(reference, whole, self.common_errors).names
-        self._known: dict[tuple[int, float], tuple[FloatArray, FloatArray]] = {}
+        self._known: dict[tuple[int, float], tuple[FloatArray, FloatArray, IntArray]] = {}
 
     @property
     def nuisances(self) -> int:
@@ -283,7 +284,7 @@ class Information:
         self, cameras: Sequence[int], exposures_ms: Sequence[float], lights: int, phase: float = 0.5
     ) -> Deviations:
         """Return the standard deviations that a fit of these frames would have."""
-        blocks, excess = self.blocks(lights, phase)
+        blocks, excess, values = self.blocks(lights, phase)
         rows = [self.rig.cameras.index(camera) for camera in cameras]
         columns = [self.exposures_ms.index(exposure) for exposure in exposures_ms]
         chosen = np.ix_(rows, columns)
@@ -293,7 +294,8 @@ class Information:
         whole = [np.zeros((count, count)) for _ in range(2)]
         for matrix, part in zip(whole, (random, common), strict=True):
             matrix[np.ix_(free, free)] = part
-        gone = [free[i] for i in lost]
+        # a fit refuses fewer values than parameters, whatever they tell of one of them
+        gone = free if values[chosen].sum() < len(free) else [free[i] for i in lost]
         variance = np.diag(whole[0] + whole[1]).copy()
         share = np.diag(whole[1]) / np.where(variance > 0, variance, 1.0)
         variance[gone] = np.inf
@@ -305,20 +307,21 @@ class Information:
         published[known] *= scale[known]
         return Deviations(published, internal, share)
 
-    def blocks(self, lights: int, phase: float = 0.5) -> tuple[FloatArray, FloatArray]:
-        """Information, and excess from shared noise, of each camera and exposure.
+    def blocks(self, lights: int, phase: float = 0.5) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Information, excess from shared noise, and number of values of each camera and exposure.
 
-        (cameras, exposures, m + q, m + q) each, the m nuisances first, then the q free parameters.
+        The first two are (cameras, exposures, m + q, m + q), the m nuisances before the q free
+        parameters, the last (cameras, exposures).
         """
         key = (lights, phase)
         if key not in self._known:
             self._known[key] = self._blocks(lights, phase)
         return self._known[key]
 
-    def _blocks(self, lights: int, phase: float) -> tuple[FloatArray, FloatArray]:
+    def _blocks(self, lights: int, phase: float) -> tuple[FloatArray, FloatArray, IntArray]:
         m, q = self.nuisances, len(self.free)
         shape = (len(self.rig.cameras), len(self.exposures_ms), m + q, m + q)
-        blocks, excess = np.zeros(shape), np.zeros(shape)
+        blocks, excess, values = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2], dtype=int)
         whole = self.rig.observe(
             self.model,
             self.values,
@@ -330,7 +333,7 @@ class Information:
         try:
             problem = make_problem(whole, self.model, self.fixed, {})
         except FitError:
-            return blocks, excess  # fewer values than parameters
+            return blocks, excess, values  # fewer values than parameters
         derivatives = self._derivatives(problem, whole)
         relative = self.rig.noise.frame_relative_std
         part = np.minimum(relative * np.abs(problem.radiance) * problem.weight, 1.0)
@@ -341,12 +344,12 @@ class Information:
                 own = np.flatnonzero((camera == number) & (sweep == e + 1))
                 each = derivatives[:, :, own]
                 flat = each.reshape(m + q, -1)
-                blocks[c, e] = flat @ flat.T
+                blocks[c, e], values[c, e] = flat @ flat.T, np.count_nonzero(problem.weight[:, own])
                 if relative:
                     shared = each * part[:, own]
                     together, alone = shared.sum(axis=1), shared.reshape(m + q, -1)
                     excess[c, e] = together @ together.T - alone @ alone.T
-        return blocks, excess
+        return blocks, excess, values
 
     def _derivatives(self, problem: Problem, observations: Observations) -> FloatArray:
         """Weighted derivatives (m + q, 3, n) by nuisances and free parameters."""

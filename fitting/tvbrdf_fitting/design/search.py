@@ -8,7 +8,7 @@ the bisection is checked: numbers up to a quarter larger must reach the accuracy
 
 A design takes the model for right: so few lights can't show that it is wrong, and a material that
 is new needs more. Predictions are to first order. Noisy scans of a design may turn out not to reach
-the accuracy, as where a peak is known by its flanks only: see `design_simulation`.
+the accuracy, as where a peak is known by its flanks only: see `simulation`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from ..geometry import FloatArray
 from ..inference.nuisances import CommonErrors
 from ..models import ReflectanceModel, get_model
 from ..models.base import ARTANH, SQUARE
-from ..problem import FitError
 from .fisher_information import Deviations, Information, Rig
 
 PHASES = (0.125, 0.375, 0.625, 0.875)
@@ -35,6 +34,7 @@ RELATIVE_ACCURACY, ANGLE_ACCURACY = 0.05, 0.03
 SMALLEST_SCALE = 0.02
 """A relative accuracy is of a value at least this large, or none would do for a value of 0."""
 _WINDOW, _WINDOW_CHECKS = 1.25, 6
+_TOO_MANY_LIGHTS = 100_000
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,6 @@ class DesignStudy:
     designs
         None of them has another one that is as good in frames, cameras and time, and better in one;
         by the number of images.
-    fewest
-        The one with the fewest images; None where none reaches the accuracy.
     largest
         The design with all cameras, exposures and lights.
     shortfalls
@@ -142,9 +140,13 @@ class DesignStudy:
     wanted: Mapping[str, float]
     most_lights: int
     designs: tuple[Design, ...]
-    fewest: Design | None
     largest: Design
     shortfalls: tuple[Shortfall, ...]
+
+    @property
+    def fewest(self) -> Design | None:
+        """The design with the fewest images; None where none reaches the accuracy."""
+        return self.designs[0] if self.designs else None
 
     def reason(self) -> str:
         """Why no design reaches the accuracy, in words; empty where one does."""
@@ -204,14 +206,15 @@ def find_designs(
     common_errors
         Errors that frames share, as for `fit_scan`.
     most_lights
-        Largest number of lights in a sweep.
+        Largest number of lights in a sweep, at most 100 000.
 
     Raises
     ------
     FitError
         The rig's directions cannot determine the model.
     ValueError
-        Unknown names or cameras, values that the model does not allow, nothing to choose from.
+        Unknown names or cameras, values that the model does not allow, nothing to choose from or
+        to find out.
     """
     chosen = get_model(model) if isinstance(model, str) else model
     values = chosen.from_mapping(parameters)
@@ -220,20 +223,24 @@ def find_designs(
     numbers = tuple(sorted(set(rig.cameras if cameras is None else cameras)))
     exposures = tuple(sorted({float(e) for e in exposures_ms}))
     unknown = [number for number in numbers if number not in rig.cameras]
-    if unknown or not numbers or not exposures or not all(e > 0 for e in exposures):
+    if unknown or not numbers or not exposures or not all(0 < e < math.inf for e in exposures):
         raise ValueError(
-            f"no design of cameras {_listed(numbers)} (the rig has {_listed(rig.cameras)}) and "
-            f"exposures of {_listed(exposures)} ms: give at least one of each, above 0"
+            f"no design of cameras {[*numbers]} (the rig has {[*rig.cameras]}) and exposures of "
+            f"{[*exposures]} ms: give at least one of each, exposures above 0"
         )
-    if most_lights < 1:
-        raise ValueError(f"most_lights = {most_lights}: at least one light is needed")
+    if not 1 <= most_lights <= _TOO_MANY_LIGHTS:
+        raise ValueError(
+            f"most_lights = {most_lights}: at least one is needed, more than {_TOO_MANY_LIGHTS} "
+            f"take too long"
+        )
     known = tuple(dict.fromkeys([*fixed, *meaningless(chosen, values)]))
+    every = default_accuracy(chosen) | dict(accuracy or {})
+    wanted = {n: every[n].of(float(parameters[n])) for n in every if n not in known}
+    if not any(math.isfinite(deviation) for deviation in wanted.values()):
+        raise ValueError(f"nothing is wanted of {chosen.name}: every parameter is fixed or any")
     information = Information(
         rig, chosen, values, exposures, fixed=known, common_errors=common_errors
     )
-    every = default_accuracy(chosen) | dict(accuracy or {})
-    names = [chosen.parameter_names[i] for i in information.free]
-    wanted = {name: every[name].of(float(parameters[name])) for name in names}
     search = _Search(information, wanted, most_lights)
     found = search.all(numbers, exposures)
     designs = tuple(sorted(_pareto(found), key=lambda d: (d.images, len(d.cameras), d.time_s)))
@@ -243,7 +250,6 @@ def find_designs(
         wanted=wanted,
         most_lights=most_lights,
         designs=designs,
-        fewest=designs[0] if designs else None,
         largest=largest,
         shortfalls=() if designs else tuple(_shortfalls(information, wanted, largest)),
     )
@@ -384,16 +390,3 @@ def _shortfalls(
 
 def _listed(items: Sequence[Any]) -> str:
     return ", ".join(f"{i:g}" if isinstance(i, float) else str(i) for i in items)
-
-
-__all__ = [
-    "Accuracy",
-    "Design",
-    "DesignStudy",
-    "FitError",
-    "Rig",
-    "Shortfall",
-    "default_accuracy",
-    "find_designs",
-    "meaningless",
-]

@@ -7,7 +7,6 @@ normal), errors that frames share are drawn anew for each scan from their priors
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,13 +38,11 @@ class SimulatedErrors:
         Interval of the simulated one from the number of scans (chi-square, `CONFIDENCE`).
     bias
         Mean error in standard deviations of the mean.
-    factor
-        From internal to published deviations; NaN where nothing is predicted.
     at_bound
         True where the material lies at a bound of the model: errors have one side there, and are
         smaller than predicted.
-    scans, seconds
-        Number, and time of all fits.
+    scans
+        How many.
     """
 
     names: tuple[str, ...]
@@ -54,10 +51,8 @@ class SimulatedErrors:
     low: FloatArray
     high: FloatArray
     bias: FloatArray
-    factor: FloatArray
     at_bound: tuple[bool, ...]
     scans: int
-    seconds: float
 
 
 def simulate_design(
@@ -83,10 +78,7 @@ def simulate_design(
 
     if scans < 2:
         raise ValueError(f"{scans} scans: at least two are needed")
-    fits = _Fits(information, design)
-    began = time.perf_counter()
-    errors = fits.errors(scans, np.random.default_rng(seed))
-    seconds = time.perf_counter() - began
+    errors = _Fits(information, design).errors(scans, np.random.default_rng(seed))
     model, free = information.model, list(information.free)
     internal = design.predicted.internal[free]
     known = np.isfinite(internal) & (internal > 0)
@@ -105,10 +97,8 @@ def simulate_design(
         low=np.sqrt(squares / chi2.isf(tail, scans)) * factor,
         high=np.sqrt(squares / chi2.ppf(tail, scans)) * factor,
         bias=errors.mean(axis=0) / (spread / np.sqrt(scans)),
-        factor=factor,
         at_bound=tuple(bool(at_bound[i]) for i in free),
         scans=scans,
-        seconds=seconds,
     )
 
 
@@ -121,14 +111,12 @@ class Trial:
     reached: bool
 
 
-def confirm(
-    study: DesignStudy, *, scans: int = 200, seed: int = 0, most_trials: int = MOST_TRIALS
-) -> tuple[Trial, ...]:
+def confirm(study: DesignStudy, *, scans: int = 200, seed: int = 0) -> tuple[Trial, ...]:
     """Simulate the designs of a study from the one with the fewest images on, until one does.
 
-    One that does not reach the accuracy, although predicted, comes again with a quarter more
-    lights, as far as there may be so many. An error that is above what is wanted by less than its
-    interval counts as reached.
+    At most `MOST_TRIALS` are simulated. One that does not reach the accuracy, although predicted,
+    comes again with a quarter more lights, as far as there may be so many. An error that is above
+    what is wanted by less than its interval counts as reached.
 
     Returns
     -------
@@ -137,7 +125,7 @@ def confirm(
     waiting = list(study.designs)
     trials: list[Trial] = []
     wanted = np.array([*study.wanted.values()])
-    while waiting and len(trials) < most_trials:
+    while waiting and len(trials) < MOST_TRIALS:
         design = min(waiting, key=lambda d: (d.images, len(d.cameras)))
         waiting.remove(design)
         errors = simulate_design(study.information, design, scans=scans, seed=seed)

@@ -10,6 +10,8 @@ fit then stays as it is, and the common errors are carried to its parameters to 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +21,6 @@ from ..problem import Problem, Solution, Solver
 from ..solve.losses import MISFIT, Loss, Reweighted, fit_reweighted
 from .nuisances import Nuisances, no_nuisances
 from .posterior import (
-    STEPS,
     Linearised,
     Point,
     Posterior,
@@ -30,9 +31,11 @@ from .posterior import (
 
 _NORMAL_MEDIAN_SQUARE = 0.4549364231195727
 """Median of z^2 for a standard normal z."""
-_HOPELESS = 4.0
-"""Excess of the limit of misfit, with nuisances but before the weights follow, that ends a try."""
-_TRIAL_STEPS = 2
+_FALLING, _TRIAL_STEPS, _DAMPED_STEPS = 0.5, 2, 8
+"""That many steps towards data that can be explained leave at most this part of the misfit; the
+second number where a shorter step must be found first."""
+_FAR = 5.0
+"""Root mean square of the nuisances, in prior deviations, that only a wrong model leads to."""
 
 
 @dataclass(frozen=True)
@@ -122,15 +125,18 @@ def _explained(
     plain: Reweighted, noise_only: Problem, nuisances: Nuisances, asked: Asked
 ) -> Marginal | None:
     """Return the posterior's maximum, or None where noise and nuisances can't explain the data."""
-    posterior = Posterior(plain.problem, nuisances)
     doubtful = plain.model_error_std > 0 or asked.loss.robust
-    start = posterior.point(plain.solution.internal)
-    maximum = maximise(posterior, start, steps=_TRIAL_STEPS if doubtful else STEPS)
-    steps, found = maximum.steps, plain
+    posterior = Posterior(_without_model_error(plain, noise_only), nuisances)
+    start, steps, found = posterior.point(plain.solution.internal), 0, plain
+    if doubtful:
+        tried = _towards(posterior, start, noise_only, asked)
+        if tried is None:
+            return None
+        start, steps = tried
+    maximum = maximise(posterior, start)
+    steps += maximum.steps
     if doubtful:
         # the plain fit's weights followed residuals that nuisances may have caused
-        if _misfit(noise_only, nuisances, maximum.point, asked.loss) > _HOPELESS * MISFIT:
-            return None
         found = _reweighted(noise_only, maximum.point, nuisances, asked)
         if found.model_error_std:
             return None
@@ -138,7 +144,8 @@ def _explained(
         maximum = maximise(posterior, posterior.point(maximum.point.internal, maximum.point.values))
         steps += maximum.steps
     point = maximum.point
-    if _misfit(noise_only, nuisances, point, asked.loss) > MISFIT:
+    far = doubtful and _root_mean_square(point.values) > _FAR
+    if far or _misfit(noise_only, nuisances, point, asked.loss) > MISFIT:
         return None
     remark = "" if maximum.settled else "; the nuisances did not settle"
     solution = replace(
@@ -156,6 +163,94 @@ def _explained(
     )
 
 
+def _without_model_error(plain: Reweighted, noise_only: Problem) -> Problem:
+    """Return the plain fit's problem with the stated noise alone, and the weights of its loss.
+
+    With the model's error in the variances, nuisances would stay at their priors' centres.
+    """
+    if not plain.model_error_std:
+        return plain.problem
+    error = plain.model_error_std * noise_only.metric.unit * noise_only.weight
+    return replace(noise_only, weight=plain.problem.weight * np.hypot(1.0, error))
+
+
+def _towards(
+    posterior: Posterior, start: Point, noise_only: Problem, asked: Asked
+) -> tuple[Point, int] | None:
+    """Return a point where noise and nuisances explain the data, and the steps; None if there
+    is none.
+
+    The plain fit may have ended in a valley, or at a bound, that only errors of gains and angles
+    led to. So the solver searches once more, with these as they were found.
+    """
+
+    def misfit(point: Point) -> float:
+        return _misfit(noise_only, posterior.nuisances, point, asked.loss)
+
+    point, steps = _falling(posterior, start, misfit)
+    solution = asked.solve(_without_gains(posterior, point.values))
+    other = posterior.point(noise_only.whole(solution.internal), point.values)
+    if other.cost < point.cost:
+        point, more = _falling(posterior, other, misfit)
+        steps += more
+    if misfit(point) > MISFIT:
+        return None
+    balanced = maximise(posterior, _balanced(posterior, point), steps=_TRIAL_STEPS)
+    nearer = balanced.point if balanced.point.cost < point.cost else point
+    return nearer, steps + balanced.steps
+
+
+def _falling(
+    posterior: Posterior, point: Point, misfit: Callable[[Point], float]
+) -> tuple[Point, int]:
+    """Return a point with less misfit, and the steps that were made while it fell fast."""
+    steps, before, left = 0, math.inf, misfit(point)
+    while MISFIT < left <= _FALLING * before:
+        maximum = maximise(posterior, point, steps=_TRIAL_STEPS)
+        if maximum.point is point:
+            maximum = maximise(posterior, point, steps=_DAMPED_STEPS)
+        point, steps = maximum.point, steps + maximum.steps
+        before, left = left, misfit(point)
+    return point, steps
+
+
+def _balanced(posterior: Posterior, point: Point) -> Point:
+    """Return a point with a factor moved from a channel's gains to its amplitudes.
+
+    So that the priors are pleased best. What is predicted hardly changes. Gauss-Newton's straight
+    steps follow this bent valley in a crawl.
+    """
+    nuisances, problem = posterior.nuisances, posterior.problem
+    gain, values = 1.0 + point.values * nuisances.deviations, point.values.copy()
+    factors = np.ones(len(nuisances.gain_of))
+    for channel, of_values in enumerate(nuisances.gain_of):
+        own = np.unique(of_values[of_values >= 0])
+        if len(own):
+            weight = gain[own] / nuisances.deviations[own] ** 2
+            factors[channel] = weight.sum() / (weight @ gain[own])
+            values[own] = (gain[own] * factors[channel] - 1.0) / nuisances.deviations[own]
+    names = {name for term in problem.model.terms for name in term.amplitudes}
+    internal = point.internal.copy()
+    for index in problem.free:
+        parameter = problem.model.parameters[index]
+        if parameter.name in names:
+            shared = parameter.channel is None
+            internal[index] /= factors.mean() if shared else factors[parameter.channel]
+    return posterior.point(problem.clamp(internal), values)
+
+
+def _without_gains(posterior: Posterior, values: FloatArray) -> Problem:
+    """Return the problem as nuisances (m,) have it, with gains in the data, as solvers take it."""
+    here = posterior.nuisances.apply(posterior.problem, values)
+    if here.to_radiance.ndim == 1:
+        return here
+    gain = posterior.nuisances.gain(values)
+    known = replace(here, to_radiance=here.to_radiance[0] / gain[0])
+    if here.metric.curve is not None:
+        return known  # which holds the data: only directions are as they were found
+    return replace(known, radiance=here.radiance / gain, weight=here.weight * gain)
+
+
 def _misfit(noise_only: Problem, nuisances: Nuisances, point: Point, loss: Loss) -> float:
     """Mean squared residual in stated deviations, as `losses.MISFIT` limits it."""
     residual = Posterior(noise_only, nuisances).point(point.internal, point.values).residual
@@ -163,6 +258,10 @@ def _misfit(noise_only: Problem, nuisances: Nuisances, point: Point, loss: Loss)
         seen = noise_only.weight.reshape(-1) > 0
         return float(np.median(np.square(residual[seen]))) / _NORMAL_MEDIAN_SQUARE
     return float(residual @ residual) / max(noise_only.degrees_of_freedom, 1)
+
+
+def _root_mean_square(values: FloatArray) -> float:
+    return math.sqrt(float(values @ values) / max(len(values), 1))
 
 
 def _reweighted(

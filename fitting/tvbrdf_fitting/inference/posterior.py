@@ -42,10 +42,10 @@ class Posterior:
         """Return a point of the posterior; the nuisances are 0 unless given."""
         chosen = np.zeros(len(self.nuisances)) if values is None else values
         here = self.nuisances.apply(self.problem, chosen) if chosen.any() else self.problem
-        residual = here.residual(internal)
-        return Point(
-            internal, chosen, here, residual, 0.5 * float(residual @ residual + chosen @ chosen)
-        )
+        with np.errstate(over="ignore"):
+            residual = here.residual(internal)
+            cost = 0.5 * float(residual @ residual + chosen @ chosen)
+        return Point(internal, chosen, here, residual, cost)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +127,14 @@ def maximise(
     `moving` are the coordinates that may change, by default the free ones; after `steps` it ends
     unsettled.
     """
+    # a lobe out of sight can have an amplitude of 1e150: what overflows is a step too far
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        return _maximise(posterior, start, moving, steps)
+
+
+def _maximise(
+    posterior: Posterior, start: Point, moving: Sequence[int] | None, steps: int
+) -> Maximum:
     slopes = _Slopes(posterior, moving)
     point, damping = start, 0.0
     linearised = slopes.linearise(point)
@@ -232,9 +240,11 @@ def _bounded_step(
 ) -> tuple[FloatArray, float]:
     """Best step (m + q,) within the bounds in the linearised system, and the decrease it gives.
 
-    Steps of columns without effect are 0.
+    Steps of columns without effect, or with one beyond all numbers, are 0.
     """
     triangle, right = linearised.triangle, linearised.right
+    if not np.isfinite(triangle).all():
+        triangle = np.where(np.isfinite(triangle).all(axis=0), triangle, 0.0)
     norms = np.linalg.norm(triangle, axis=0)
     scale = np.where(norms > 0, norms, 1.0)
     scaled, target = triangle / scale, -right

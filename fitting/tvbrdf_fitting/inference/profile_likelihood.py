@@ -51,7 +51,9 @@ def interval(result: FitResult, name: str, sigmas: float) -> tuple[float, float]
         if result.optimum is not None:
             leader = result.optimum.posterior.problem.tied.get(index, index)
             reach = sigmas * _left_out(result, leader)
-            ends = profile_interval(result.optimum, leader, result.internal_covariance, reach)
+            # a lobe out of sight can have an amplitude of 1e200: steps too far overflow
+            with np.errstate(all="ignore"):
+                ends = profile_interval(result.optimum, leader, result.internal_covariance, reach)
             low, high = ends
         else:
             reach = max(sigmas, NEAR) * deviation

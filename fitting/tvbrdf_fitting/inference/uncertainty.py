@@ -38,6 +38,9 @@ SIGNIFICANCE = 3.0
 """An amplitude within this many standard deviations of 0 carries no information on its shape."""
 _RANK = 1e-10
 _NULL_SHARE = 1e-3
+_FAINTEST = 1e-150
+"""Effect of a unit of a coordinate, in deviations of the data, below which it has none: the
+variance would overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +105,7 @@ class _Informed:
         moving, triangle = linearised.moving, linearised.triangle
         first = m if linearised.priors else 0
         scale = np.linalg.norm(triangle[:, first : first + len(moving)], axis=0)
-        known = scale > 0
+        known = scale > _FAINTEST
         self.columns = [i for i, k in zip(moving, known, strict=True) if k]
         self._kept = np.ones(len(triangle), dtype=bool)
         self._kept[first : first + len(moving)] = known

@@ -17,12 +17,9 @@ Colours are in B, G, R order.
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,9 +32,9 @@ from .response import (
     ResponseKind,
     largest_code,
 )
+from .strict_fields import StrictFields, numbers_of
 
 Bgr = tuple[float, float, float]
-_Option = TypeVar("_Option", bound=str)
 HardwareStampEvent = Literal["exposure_start", "exposure_middle", "exposure_end"]
 
 CAMERAS = (1, 2, 3, 4)
@@ -207,6 +204,10 @@ class Calibration:
         )
 
 
+class _Fields(StrictFields):
+    fault = CalibrationError
+
+
 def load_calibration(path: str | Path) -> Calibration:
     """Read a calibration file (YAML).
 
@@ -336,102 +337,10 @@ def _optional_rectangle(fields: _Fields, key: str) -> Rectangle | None:
 def _intervals(fields: _Fields, key: str) -> tuple[tuple[float, float], ...]:
     value = fields.take(key)
     remedy = "give a list of [from, to] in degrees within [-180, 180], or [] for none"
-    pairs = [_numbers(pair, 2) for pair in value] if isinstance(value, list) else [None]
+    pairs = [numbers_of(pair, 2) for pair in value] if isinstance(value, list) else [None]
     intervals = []
     for pair in pairs:
         if pair is None or not -180.0 <= pair[0] < pair[1] <= 180.0:
             raise fields.error(key, value, remedy)
         intervals.append((pair[0], pair[1]))
     return tuple(intervals)
-
-
-def _number(value: object) -> float | None:
-    """Return a finite number, or None; YAML reads 1e-3, without a point, as text."""
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        return None
-    try:
-        number = float(value)
-    except (ValueError, OverflowError):
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _numbers(value: object, count: int | None = None) -> tuple[float, ...] | None:
-    if not isinstance(value, list) or (count is not None and len(value) != count):
-        return None
-    numbers = tuple(number for number in map(_number, value) if number is not None)
-    return numbers if len(numbers) == len(value) else None
-
-
-class _Fields:
-    """A mapping whose keys must all be known and of the right kind."""
-
-    def __init__(self, data: object, where: str, defaults: Mapping[Any, Any] | None = None) -> None:
-        if not isinstance(data, Mapping):
-            found = "nothing" if data is None else type(data).__name__
-            raise CalibrationError(f"{where}: has {found} where keys with values are needed")
-        self.where = where
-        self._data = {**(defaults or {}), **data}
-        self._known: set[str] = set()
-
-    def error(self, key: str, value: object, remedy: str) -> CalibrationError:
-        shown = repr(value) if len(repr(value)) < 80 else f"{repr(value)[:76]}..."
-        return CalibrationError(f"{self.where}: {key}: {shown} will not do; {remedy}")
-
-    def take(self, key: str) -> Any:
-        self._known.add(key)
-        if key not in self._data:
-            raise CalibrationError(f"{self.where}: {key} is missing; add it")
-        return self._data[key]
-
-    def child(self, key: str) -> _Fields:
-        return _Fields(self.take(key), f"{self.where}: {key}")
-
-    def mapping(self, key: str) -> Mapping[Any, Any]:
-        value = self.take(key)
-        if not isinstance(value, Mapping):
-            raise self.error(key, value, "give keys with values")
-        return value
-
-    def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
-        value = self.take(key)
-        number = _number(value)
-        if number is None or not low <= number <= high:
-            raise self.error(key, value, f"give a number in [{low:g}, {high:g}]")
-        return number
-
-    def integer(self, key: str, low: int, high: int) -> int:
-        number = self.number(key, low, high)
-        if number != int(number):
-            raise self.error(key, number, "give a whole number")
-        return int(number)
-
-    def numbers(self, key: str) -> tuple[float, ...]:
-        value = self.take(key)
-        numbers = _numbers(value)
-        if numbers is None:
-            raise self.error(key, value, "give a list of numbers")
-        return numbers
-
-    def bgr(self, key: str) -> Bgr:
-        value = self.take(key)
-        numbers = _numbers(value, 3)
-        if numbers is None or min(numbers) <= 0.0:
-            raise self.error(key, value, "give three numbers above 0: [blue, green, red]")
-        return numbers[0], numbers[1], numbers[2]
-
-    def choice(self, key: str, *options: _Option) -> _Option:
-        value = self.take(key)
-        for option in options:
-            if value == option:
-                return option
-        raise self.error(key, value, f"use one of {', '.join(options)}")
-
-    def finish(self) -> None:
-        """Refuse keys that nobody asked for."""
-        for key in self._data:
-            if key not in self._known:
-                close = difflib.get_close_matches(str(key), self._known, n=1)
-                hint = f"did you mean {close[0]}?" if close else "remove it."
-                known = ", ".join(sorted(self._known))
-                raise CalibrationError(f"{self.where}: unknown key {key!r}; {hint} Known: {known}")

@@ -82,12 +82,6 @@ class ClockModel:
         correction = np.rint(elapsed * self.drift).astype(np.int64)
         return np.asarray(self.run_origin_ns + elapsed + correction, dtype=np.int64)
 
-    def to_hardware_ns(self, run_ns: ArrayLike) -> IntArray:
-        """Device's clock (int64, any shape) at stamps of the run's clock; exact to 1 ns."""
-        elapsed = np.asarray(run_ns, dtype=np.int64) - self.run_origin_ns
-        correction = np.rint(elapsed * (self.drift / (1.0 + self.drift))).astype(np.int64)
-        return np.asarray(self.hardware_origin_ns + elapsed - correction, dtype=np.int64)
-
     def std_ns(self, hardware_ns: ArrayLike) -> FloatArray:
         """Standard deviation of `to_run_ns` at the given device stamps, in ns.
 

@@ -152,13 +152,6 @@ class FrameReducer:
         return by_opencv
 
 
-def reduce_frame(
-    image: NDArray[np.uint8] | NDArray[np.uint16], camera: CameraCalibration
-) -> PatchStatistics:
-    """Reduce one frame; see `FrameReducer.reduce`. Builds the camera's tables each time."""
-    return FrameReducer(camera).reduce(image)
-
-
 def is_saturated(
     region: RegionStatistics, black_level_dn: FloatArray, camera: CameraCalibration
 ) -> NDArray[np.bool_]:

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..geometry import BoolArray, FloatArray, IntArray
 
 DEFAULT_MAX_GAP_MS = 200.0
-_SPEED_REPORTS = 5  # reports that a speed is taken from where none is reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +78,6 @@ class LightPath:
         speeds = columns[1][kept] if len(columns) == 2 else None
         return cls(stamps, columns[0][kept], speeds, max_gap_ms)
 
-    @property
-    def direction(self) -> int:
-        """+1 for a sweep to larger angles, -1 for one to smaller, 0 for an arm that stayed."""
-        return int(np.sign(self.angle_deg[-1] - self.angle_deg[0]))
-
     def known_at(self, stamp_ns: ArrayLike) -> BoolArray:
         """Whether the stamps (any shape) lie between reports that are close enough in time."""
         stamps = np.asarray(stamp_ns, dtype=np.int64)
@@ -103,34 +97,6 @@ class LightPath:
     def speed_at(self, stamp_ns: ArrayLike) -> FloatArray:
         """Speed in degrees a second (signed) at the stamps (any shape); NaN where not known."""
         return self._interpolate(stamp_ns)[1]
-
-    def constant_speed_intervals(self, tolerance: float = 0.02) -> IntArray:
-        """First and last stamp, (k, 2) ns, of the stretches in which the light's speed is steady.
-
-        Steady is a speed within ``tolerance`` (relative) of the cruising speed, which is the
-        median of all reports that are faster than half the fastest. Stretches shorter than three
-        reports are left out.
-        """
-        speed = self._report_speeds()
-        moving = np.abs(speed) > 0.5 * np.max(np.abs(speed))
-        if not np.any(moving):
-            return np.zeros((0, 2), dtype=np.int64)
-        cruise = float(np.median(speed[moving]))
-        steady = np.concatenate(
-            [[False], np.abs(speed - cruise) <= tolerance * abs(cruise), [False]]
-        )
-        edges = np.flatnonzero(np.diff(steady))
-        first, last = edges[0::2], edges[1::2] - 1
-        long = last - first >= 2
-        return np.stack([self.stamp_ns[first[long]], self.stamp_ns[last[long]]], axis=1)
-
-    def is_constant_speed(self, stamp_ns: ArrayLike, tolerance: float = 0.02) -> BoolArray:
-        """Whether the stamps (any shape) lie in a stretch of `constant_speed_intervals`."""
-        stamps = np.asarray(stamp_ns, dtype=np.int64)
-        steady = np.zeros(stamps.shape, dtype=np.bool_)
-        for first, last in self.constant_speed_intervals(tolerance):
-            steady |= (stamps >= first) & (stamps <= last)
-        return steady
 
     def _interval(self, stamps: IntArray) -> NDArray[np.intp]:
         left = np.searchsorted(self.stamp_ns, stamps, side="right") - 1
@@ -157,13 +123,3 @@ class LightPath:
             )
         known = self.known_at(stamps)
         return np.where(known, angle, np.nan), np.where(known, speed, np.nan)
-
-    def _report_speeds(self) -> FloatArray:
-        """Speed at each report, (n,)."""
-        if self.speed_deg_s is not None:
-            return self.speed_deg_s
-        reach = min(_SPEED_REPORTS, self.stamp_ns.size) - 1
-        index = np.arange(self.stamp_ns.size)
-        first = np.clip(index - reach // 2, 0, self.stamp_ns.size - 1 - reach)
-        elapsed_s = (self.stamp_ns[first + reach] - self.stamp_ns[first]) / 1e9
-        return np.asarray((self.angle_deg[first + reach] - self.angle_deg[first]) / elapsed_s)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import FloatArray
-from .scan_merge import SweepObservations
+from .sweep_merge import SweepObservations
 
 _SAMPLES = 5
 _MAX_GAP_STEPS = 1.5

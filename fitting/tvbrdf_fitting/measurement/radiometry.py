@@ -34,7 +34,6 @@ class DarkLevel:
 
     mean_dn: FloatArray
     variance_dn2: FloatArray
-    frame_count: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +74,6 @@ def dark_level(regions: Sequence[RegionStatistics], camera: CameraCalibration) -
         return DarkLevel(
             mean_dn=np.full(3, camera.black_level_dn),
             variance_dn2=np.full(3, camera.black_level_std_dn**2),
-            frame_count=0,
         )
     pixel_count = regions[0].pixel_count
     means = np.stack([region.mean_dn for region in regions])
@@ -90,7 +88,7 @@ def dark_level(regions: Sequence[RegionStatistics], camera: CameraCalibration) -
     variance = camera.pixel_variance_dn2(np.zeros(3)) / pixel_count
     if len(regions) > 1:
         variance = np.maximum(variance, means.var(axis=0, ddof=1))
-    return DarkLevel(mean, variance / len(regions), len(regions))
+    return DarkLevel(mean, variance / len(regions))
 
 
 def region_radiance(

@@ -12,7 +12,7 @@ With h the half vector and theta_d the angle of light or view to it::
 
 D is normalised and the denominator has a 4, as in Walter et al. (Cook and Torrance print pi, with
 another scale of D). G is Smith's product of two maskings, for their V-cavities; formulas in
-`facets`. F is Fresnel's reflectance of unpolarised light, in `optics`. Facets reflect once, so the
+`facets`. F is Fresnel's reflectance of unpolarised light, in `fresnel`. Facets reflect once, so the
 albedo is at most Ks.
 
 Ks and eta are nearly confounded: at angles theta_d below some 50 degrees F is nearly its value at
@@ -31,13 +31,13 @@ import numpy as np
 from ..geometry import FloatArray
 from .base import LOG, Parameter, Transform
 from .facets import GGX, Basis, Beckmann, Facets, basis
-from .lobe import Lobe
-from .optics import (
+from .fresnel import (
     conductor_reflectance,
     conductor_reflectance_slopes,
     dielectric_reflectance,
     dielectric_reflectance_slope,
 )
+from .lobe import Lobe
 from .registry import Registration, label
 
 ALPHA_BOUNDS = (0.005, 1.5)

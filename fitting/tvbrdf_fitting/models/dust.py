@@ -57,8 +57,9 @@ _G = Parameter(
     full_scale=1.0,
     typical=0.35,
 )
+# no thicker: from 4 the first step of an unbounded solver leads to 12, where nothing has a slope
 _TAU = Parameter(
-    "tau", "1", 0.0, 50.0, grid=(0.02, 0.07, 0.2, 0.6, 1.5, 4.0), full_scale=10.0, typical=0.6
+    "tau", "1", 0.0, 50.0, grid=(0.02, 0.07, 0.2, 0.6, 1.5, 3.0), full_scale=10.0, typical=0.6
 )
 
 

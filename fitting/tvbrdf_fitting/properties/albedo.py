@@ -34,7 +34,7 @@ from ..models.ideal import delta_lobes
 from .quadrature import Integral, integrate, peaks
 
 Kind = Literal["directional-hemispherical", "hemispherical-directional"]
-KINDS: tuple[str, ...] = get_args(Kind)
+KINDS: tuple[Kind, ...] = get_args(Kind)
 
 INNER = 0.1
 """Tolerance of the integrals over theta, relative to that of the integral over phi."""

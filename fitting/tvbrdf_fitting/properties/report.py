@@ -5,7 +5,7 @@ negative, and scatters no more light than falls on it: its albedo (the direction
 one) is at most 1 at every angle. Many published models break one of these somewhere; fits may use
 them all the same, but should know.
 
-Reciprocity and sign are tried on many pairs of directions, see `model_trials`; albedos are
+Reciprocity and sign are tried on many pairs of directions, see `trials`; albedos are
 integrated, see `albedo` and `bihemispherical`.
 """
 
@@ -20,12 +20,11 @@ from numpy.typing import ArrayLike
 
 from ..geometry import FloatArray
 from ..models.base import ReflectanceModel
-from .albedo import Kind, directional_albedo, symmetries
+from .albedo import KINDS, Kind, directional_albedo, symmetries
 from .bihemispherical import hemispherical_reflectance
 from .trials import RECIPROCITY_LIMIT, SEARCH_DEG, AlbedoCurve, EnergyRange, Pair, try_pairs
 
 ANGLES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 80.0, 85.0, 89.0)
-ALBEDO_KINDS: tuple[Kind, ...] = ("directional-hemispherical", "hemispherical-directional")
 AZIMUTHS_DEG = (0.0, 45.0, 90.0, 135.0)
 """Of the light, where the model is not isotropic."""
 
@@ -49,6 +48,8 @@ class ModelReport:
     ----------
     model, parameters
         Name, and published values by name.
+    out_of_bounds
+        Names of parameters outside the model's bounds: it promises nothing there.
     reciprocal, nonnegative
         What the model promises.
     isotropic
@@ -62,8 +63,8 @@ class ModelReport:
     negative_share
         Share of pairs of directions (by solid angles) with a value below 0.
     albedo
-        Directional-hemispherical; for models that are not reciprocal, hemispherical-directional
-        rows follow.
+        Directional-hemispherical, which is the hemispherical-directional one too where the model is
+        reciprocal; else rows of that one follow.
     bihemispherical, bihemispherical_error
         Share of uniform light that is scattered, channels B, G, R.
     largest_albedo
@@ -76,6 +77,7 @@ class ModelReport:
 
     model: str
     parameters: dict[str, float]
+    out_of_bounds: tuple[str, ...]
     reciprocal: bool
     nonnegative: bool
     isotropic: bool
@@ -103,12 +105,13 @@ class ModelReport:
     @property
     def breaks_sign(self) -> bool:
         """Whether a value is negative although the model promises that none is."""
-        return self.nonnegative and self.smallest.value < 0
+        return self.nonnegative and not self.out_of_bounds and self.smallest.value < 0
 
     @property
     def good(self) -> bool:
-        """Whether no energy is created and every promise is kept."""
-        return not (self.creates_energy or self.breaks_reciprocity or self.breaks_sign)
+        """Whether parameters are within bounds, no energy is created and promises are kept."""
+        broken = self.breaks_reciprocity or self.breaks_sign
+        return not (self.out_of_bounds or self.creates_energy or broken)
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain values."""
@@ -152,10 +155,9 @@ def check_model(
     isotropic = symmetries(model, values).isotropic
     azimuths = (0.0,) if isotropic else AZIMUTHS_DEG
     tried = try_pairs(model, values)
-    kinds = ALBEDO_KINDS[: 1 if model.reciprocal else 2]
     rows = tuple(
         row
-        for kind in kinds
+        for kind in KINDS[: 1 if model.reciprocal else 2]
         for phi_deg in azimuths
         for row in _albedo_rows(model, values, angles_deg, phi_deg, kind, tolerance)
     )
@@ -163,9 +165,11 @@ def check_model(
         model, values, tolerance=max(min(100 * tolerance, 1e-2), 0.0 if isotropic else 1e-3)
     )
     curves = [AlbedoCurve(model, values, phi_deg) for phi_deg in azimuths]
+    pairs = zip(model.parameters, values.tolist(), strict=True)
     report = ModelReport(
         model=model.name,
         parameters=named,
+        out_of_bounds=tuple(p.name for p, value in pairs if not p.lower <= value <= p.upper),
         reciprocal=model.reciprocal,
         nonnegative=model.nonnegative,
         isotropic=isotropic,
@@ -204,10 +208,10 @@ def _albedo_rows(
 
 
 def _findings(report: ModelReport, model: ReflectanceModel) -> Iterator[str]:
-    lower, upper = model.bounds
-    for index, (name, value) in enumerate(report.parameters.items()):
-        if not lower[index] <= value <= upper[index]:
-            yield f"{name} = {value:g} lies outside its bounds {lower[index]:g} to {upper[index]:g}"
+    for p in model.parameters:
+        if p.name in report.out_of_bounds:
+            value = report.parameters[p.name]
+            yield f"{p.name} = {value:g} lies outside its bounds {p.lower:g} to {p.upper:g}"
     if report.delta:
         yield "an ideal mirror or refraction is part of it: albedos count it, the rest does not"
     if not report.isotropic and model.isotropic:
@@ -220,7 +224,7 @@ def _findings(report: ModelReport, model: ReflectanceModel) -> Iterator[str]:
     if smallest.value < 0:
         share = f"{report.negative_share:.2%}" if report.negative_share else "few"
         share = f"below 0 in {share} of the pairs of directions"
-        promise = ", although the model promises otherwise" if report.nonnegative else ""
+        promise = ", although the model promises otherwise" if report.breaks_sign else ""
         yield f"{share}{promise}: {smallest.value:.3g} 1/sr ({smallest})"
     grouped: dict[tuple[Any, ...], list[str]] = {}
     for one in report.energy:

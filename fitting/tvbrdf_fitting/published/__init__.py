@@ -1,7 +1,7 @@
 """The published database's text layout, read and written.
 
-One public face of :mod:`.published_scan` (``tvBrdf-data/``), :mod:`.published_info`
-(``tvBrdf-info.txt``) and :mod:`.published_sample` (fits, calibration), which state the layout.
+One public face of :mod:`.scan` and :mod:`.scan_file` (``tvBrdf-data/``), :mod:`.info`
+(``tvBrdf-info.txt``) and :mod:`.sample` (fits, calibration), which state the layout.
 Colours are in B, G, R order everywhere. Readers are strict: an error names file, line and what was
 wrong. Writers are their exact inverses to the 6 decimals of the layout, and write a whole file or
 none.
@@ -33,16 +33,13 @@ from .sample import (
 )
 from .scan import (
     CAMERAS,
-    CameraScan,
     PublishedScan,
-    format_scan_file,
     list_scans,
     parse_scan_file_name,
     read_scan,
-    read_scan_file,
     scan_file_name,
-    write_scan_file,
 )
+from .scan_file import CameraScan, format_scan_file, read_scan_file, write_scan_file
 from .text import PublishedFormatError, write_atomically
 
 __all__ = [

@@ -30,10 +30,10 @@ from .observations import ASSUMED_RELATIVE, FEWEST_DIFFERENCES
 from .scan import (
     CAMERAS,
     DATA_FOLDER,
-    CameraScan,
     PublishedScan,
     parse_scan_file_name,
 )
+from .scan_file import CameraScan
 
 MISSING_AT_AN_END: Final = 5
 """Light positions that the other cameras have beyond a file's end, to be told."""

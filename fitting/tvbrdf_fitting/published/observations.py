@@ -104,7 +104,7 @@ def estimate_variance(
     for number in np.unique(camera):
         rows = np.flatnonzero(camera == number)
         rows = rows[np.argsort(angle[rows], kind="stable")]
-        smooth[rows] = np.stack([_smoothed(channel) for channel in radiance[rows].T], axis=1)
+        smooth[rows] = _smoothed(radiance[rows])
         for square, level in _differences(angle[rows], radiance[rows]):
             squares.append(square)
             levels.append(level)
@@ -127,16 +127,23 @@ def _differences(angle: FloatArray, values: FloatArray) -> Iterator[tuple[FloatA
     """Yield squared scaled third differences (m, 3) of (n, 3) values, and their mean values."""
     if len(angle) < 4:
         return
-    x = np.lib.stride_tricks.sliding_window_view(angle, 4)
-    step = np.diff(x, axis=1)
-    known = (step > 0).all(axis=1) & (step < _GAP_STEPS * np.median(np.diff(angle))).all(axis=1)
-    x = x[known]
-    between = x[:, :, None] - x[:, None, :]
-    between[:, range(4), range(4)] = 1.0
-    weight = 1.0 / between.prod(axis=2)
-    weight /= np.linalg.norm(weight, axis=1, keepdims=True)
-    y = np.lib.stride_tricks.sliding_window_view(values, 4, axis=0)[known]
-    yield np.square(np.einsum("mck,mk->mc", y, weight)), y.mean(axis=2)
+    step = np.diff(angle)
+    near = (step > 0) & (step < _GAP_STEPS * np.median(step))
+    known = near[:-2] & near[1:-1] & near[2:]
+    one, two, three = step[:-2][known], step[1:-1][known], step[2:][known]
+    first, last, all_three = one + two, two + three, one + two + three
+    # Lagrange's: 1 / product of the distances to the three others
+    weights = np.array(
+        [
+            -1 / (one * first * all_three),
+            1 / (one * two * last),
+            -1 / (first * two * three),
+            1 / (all_three * last * three),
+        ]
+    )
+    weights /= np.sqrt(np.square(weights).sum(axis=0))
+    windows = np.array([values[i : len(values) - 3 + i][known] for i in range(4)])
+    yield np.square((weights[:, :, None] * windows).sum(axis=0)), windows.mean(axis=0)
 
 
 def _camera_noise(square: FloatArray, level: FloatArray) -> tuple[FloatArray, float]:
@@ -147,20 +154,28 @@ def _camera_noise(square: FloatArray, level: FloatArray) -> tuple[FloatArray, fl
         return np.array([0.0, 0.0, ASSUMED_RELATIVE**2]), np.inf
     order = np.argsort(level, kind="stable")
     count = max(1, min(len(order) // _IN_A_BIN, _MOST_BINS))
-    bins = np.array_split(order, count)
-    variance = np.array([np.median(square[rows]) for rows in bins]) / _NORMAL_MEDIAN_SQUARE
-    signal = np.array([max(float(np.median(level[rows])), 0.0) for rows in bins])
+    variance = _bin_medians(square[order], count) / _NORMAL_MEDIAN_SQUARE
+    signal = np.maximum(_bin_medians(level[order], count), 0.0)
     # a bin that is known to a tenth of itself weighs as much as any other
     weight = 1.0 / np.maximum(variance, max(1e-6 * float(variance.max()), ROUNDING**2))
     terms, _ = nnls(np.vander(signal, 3, increasing=True) * weight[:, None], variance * weight)
     return np.asarray(terms), float(signal.max())
 
 
+def _bin_medians(values: FloatArray, count: int) -> FloatArray:
+    """Medians (count,) of as many bins of nearly equal size, in order."""
+    size, larger = divmod(len(values), count)
+    cut = larger * (size + 1)
+    blocks = (values[:cut].reshape(larger, size + 1), values[cut:].reshape(count - larger, size))
+    return np.concatenate([np.median(block, axis=1) for block in blocks])
+
+
 def _smoothed(values: FloatArray) -> FloatArray:
-    """Mean over up to five neighbours, shape kept (n,)."""
+    """Mean over up to five neighbours, shape kept (n, 3)."""
     kernel = np.ones(min(_SMOOTHED, len(values)))
     count = np.convolve(np.ones(len(values)), kernel, mode="same")
-    return np.asarray(np.convolve(values, kernel, mode="same") / count)
+    sums = [np.convolve(channel, kernel, mode="same") for channel in values.T]
+    return np.asarray((np.array(sums) / count).T)
 
 
 def stored_observations(scan: StoredScan) -> tuple[Observations, CommonErrors | None]:

@@ -1,6 +1,6 @@
 """A sample of the published database: its scans, fitted parameters, information, calibration.
 
-Below the sample's folder ``sampleNN``, beside ``tvBrdf-data/`` (see :mod:`.published_scan`):
+Below the sample's folder ``sampleNN``, beside ``tvBrdf-data/`` (see :mod:`.scan`):
 
 ``tvBrdf-fits/brdf-params.txt``
     A line a fitted scan, in the order of the scans, 6 decimals: ``Kd_b Kd_g Kd_r sigma_d Ks
@@ -8,7 +8,7 @@ Below the sample's folder ``sampleNN``, beside ``tvBrdf-data/`` (see :mod:`.publ
     (the layout has no way to write "unknown"): ``tvBrdf-info.txt`` says which scans are there.
     Without ``tvBrdf-info.txt`` there must be a line for each scan.
 ``tvBrdf-info.txt``
-    Which scans there are, and when they were made; see :mod:`.published_info`.
+    Which scans there are, and when they were made; see :mod:`.info`.
 ``tvBrdf-calibration.txt``
     Four lines (a camera each) of three numbers (B, G, R) by which the radiances are to be
     divided. Where there is none, all are 1.

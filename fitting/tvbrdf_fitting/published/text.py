@@ -11,9 +11,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-DECIMALS = 6
-"""Decimals of every number in the published files."""
-
 TEMPORARY_PREFIX = ".writing-"
 """Beginning of the name of a file that is not whole yet."""
 

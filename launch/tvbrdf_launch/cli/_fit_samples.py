@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from tvbrdf_fitting.choice.choose import ModelChoice
@@ -303,14 +303,14 @@ def _load_solver(observations: Observations, request: Request) -> None:
 
 
 def _choices(read: Sequence[_Read], request: Request) -> Sequence[ModelChoice]:
-    """Choose a model for one scan, or one for all; all have the calibration of the first."""
+    """Choose a model for one scan, or one for all; each scan has errors that its frames share."""
     from tvbrdf_fitting.choice.choose import choose_for_series, choose_model
 
-    options = {**request.options, "common_errors": read[0].common}
+    scans, common = [one.observations for one in read], [one.common for one in read]
     if len(read) == 1:
-        return [choose_model(read[0].observations, **options)]
-    scans = [one.observations for one in read]
-    return choose_for_series(scans, mode="per_scan" if request.scan_by_scan else "joint", **options)
+        return [choose_model(scans[0], common_errors=common[0], **request.options)]
+    mode: Literal["joint", "per_scan"] = "per_scan" if request.scan_by_scan else "joint"
+    return choose_for_series(scans, mode=mode, common_errors=common, **request.options)
 
 
 def _fitted(number: int, read: _Read, fit: FitResult, choice: ModelChoice | None) -> FittedScan:

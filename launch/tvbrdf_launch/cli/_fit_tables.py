@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from tvbrdf_fitting.choice.choose import ModelChoice, Rung
     from tvbrdf_fitting.error_measures import ErrorMeasures
     from tvbrdf_fitting.result import FitResult
-    from tvbrdf_rendering.fit_report import FittedSample, FittedScan, Trend
+    from tvbrdf_rendering.fit_report import FittedSample, FittedScan
+    from tvbrdf_rendering.trend import Trend
 
 LARGEST_WIDTH = 110
 MARKS = "* ended at a bound, ? not determined by the data, = fixed"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +13,6 @@ from tvbrdf_fitting.observations import Observations
 from tvbrdf_fitting.problem import Problem
 from tvbrdf_fitting.solve.solvers import SOLVERS
 
-Solve = Callable[[Problem], FloatArray]
-"""From a problem to internal coordinates (p,)."""
 PRECISIONS = {"float64": np.float64, "float32": np.float32, "float16": np.float16}
 """Of radiances and directions as they are given; all arithmetic is in float64."""
 SINGLE_START = "scipy lm"

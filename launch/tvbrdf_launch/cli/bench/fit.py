@@ -64,6 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
     from . import grid, table
 
     plan: Plan = grid.QUICK if arguments.quick else grid.Plan()
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)  # before the minutes of work, if it can't be made
     cells: list[Cell]
     if arguments.path is None:
         title = f"Oren-Nayar + Torrance-Sparrow, {plan.scenes} simulated materials"
@@ -72,8 +74,6 @@ def run(arguments: argparse.Namespace) -> int:
         observations, number = read(arguments.path, arguments.scan)
         title = f"{arguments.path.resolve().name}, scan {number}, against the fit of all of it"
         cells = grid.on_scan(observations, plan, _progress())
-    out: Path = arguments.out
-    out.mkdir(parents=True, exist_ok=True)
     rows = [cell.as_dict() for cell in cells]
     text = f"{title}; {table.machine()}\n\n{table.as_text(cells)}\n"
     written = {name: out / f"speed_error.{name}" for name in ("png", "csv", "txt")}

@@ -36,6 +36,7 @@ QUANTILE = 0.95
 SAME_ERROR, LEAST_ERROR = 0.02, 1e-5
 """Errors that differ by less, relative or absolute, count as equal, as where solvers agree."""
 SLOW_S = 0.005
+"""A fit that takes longer is timed once."""
 FULL_PRECISION = "float64"
 Progress = Callable[[int, int], None]
 

@@ -21,10 +21,10 @@ class Hemisphere:
     The error of a BRDF is ``sqrt(int (f - g)^2 dm / int g^2 dm)`` with ``dm = cos(theta_i)
     cos(theta_r) domega_i domega_r``, and the mean over the channels in both integrals. Both angles
     are below 80 degrees: where light and view graze, Torrance-Sparrow's lobe grows without limit,
-    and a few pairs would decide. Half of the
-    pairs are uniform in that measure; in the other half the logarithm of the half vector's angle to
-    the normal is, which finds lobes of any width. Each pair is weighted by its density in the two
-    together (the balance heuristic of Veach and Guibas, SIGGRAPH 1995).
+    and a few pairs would decide. Half of the pairs are uniform in that measure; in the other half
+    the logarithm of the half vector's angle to the normal is, which finds lobes of any width. Each
+    pair is weighted by its density in the two together (the balance heuristic of Veach and Guibas,
+    SIGGRAPH 1995).
     """
 
     def __init__(self, model: ReflectanceModel, samples: int = SAMPLES) -> None:

@@ -67,13 +67,13 @@ def _by_solver(cells: Sequence[Cell]) -> str:
             cell = _one(own, lights=lights, solver=solver)
             same = alike(cell.brdf_95, ours.brdf_95)
             other = "" if same else f" ({_number(100 * cell.brdf_95)})"
-            row.append(f"{cell.time_ms:.3g}{other}")
+            row.append(f"{cell.time_ms:.3g}{other} {_front(cell)}")
         rows.append(row)
     title = (
         f"Time of a fit in ms (geometry and solving), {cameras} cameras (95 % of the BRDF's error, "
         f"where it is not that of {_OURS})"
     )
-    return _columns(title, ["lights", *solvers], rows)
+    return _columns(title, ["lights", *(f"{solver}   " for solver in solvers)], rows)
 
 
 def _parameters(cells: Sequence[Cell]) -> str:

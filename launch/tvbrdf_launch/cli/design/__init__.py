@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from .._common import Subparsers, add_json_option, add_verb, count, print_json
-from ._asked import integer_list, not_negative, number_list, part_of_one, word_list
+from ._asked import finite, fraction, integer_list, not_negative, number_list, word_list
 
 if TYPE_CHECKING:
     from tvbrdf_fitting.design.search import DesignStudy
@@ -48,7 +48,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="N",
         help="noisy scans to fit of what is proposed (default 200; 0: none)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of their noise (default 0)")
+    parser.add_argument("--seed", type=not_negative, default=0, help="of their noise (default 0)")
     add_json_option(parser)
 
 
@@ -66,7 +66,7 @@ def _add_material(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--scan", type=count, metavar="N", help="of a fit's file that has several")
     parser.add_argument(
-        "--at-s", type=float, default=0.0, metavar="SECONDS", help="time of a sample (default 0)"
+        "--at-s", type=finite, metavar="SECONDS", help="time of a sample (default 0)"
     )
 
 
@@ -98,7 +98,7 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--gain-error",
-        type=part_of_one,
+        type=fraction,
         default=0.0,
         metavar="PART",
         help="of each camera, as in 0.5%%",
@@ -139,11 +139,11 @@ def run(arguments: argparse.Namespace) -> int:
             common_errors=common,
             most_lights=arguments.most_lights,
         )
+        trials: tuple[Trial, ...] = ()
+        if arguments.simulate:
+            trials = confirm(study, scans=arguments.simulate, seed=arguments.seed)
     except ValueError as error:
         raise RunError(str(error)) from error
-    trials: tuple[Trial, ...] = ()
-    if arguments.simulate and study.wanted:
-        trials = confirm(study, scans=max(arguments.simulate, 2), seed=arguments.seed)
     reason = _reason(study, trials)
     if arguments.json:
         print_json(as_dict(study, trials, source) | {"reason": reason})

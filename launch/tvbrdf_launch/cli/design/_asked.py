@@ -27,12 +27,18 @@ def find_material(arguments: argparse.Namespace) -> tuple[ReflectanceModel, dict
         name = "ON+TS"
     known: Mapping[str, float] = {}
     suffix = name.rpartition(".")[2]
+    is_sample = name in available("samples") or suffix in {"yaml", "yml"} or name[:9] == "measured:"
+    if arguments.scan is not None and suffix != "json":
+        raise RunError("--scan needs the .json file of a fit")
+    if arguments.at_s is not None and not is_sample:
+        raise RunError("--at-s needs a sample, whose parameters change with time")
     if suffix == "json":
         model_name, known = _from_fit(name, arguments.scan)
         source = f"fit {name}" + (f", scan {arguments.scan}" if arguments.scan else "")
-    elif name in available("samples") or suffix in {"yaml", "yml"} or name.startswith("measured:"):
-        model_name, known = _from_sample(name, arguments.at_s)
-        source = f"sample {name} at {arguments.at_s:g} s"
+    elif is_sample:
+        time_s = arguments.at_s or 0.0
+        model_name, known = _from_sample(name, time_s)
+        source = f"sample {name} at {time_s:g} s"
     else:
         try:
             model_name = find_model(arguments.model or name).name
@@ -121,20 +127,20 @@ def rig_of(arguments: argparse.Namespace) -> Rig:
     from ...errors import RunError, did_you_mean
 
     known = [field.name for field in fields(NoiseModel)]
-    noise: dict[str, Any] = {}
+    noise: dict[str, float] = {}
     for word in arguments.noise:
         name, value = _assigned(word, "--noise")
         if name not in known:
             raise RunError(f"--noise: no {name!r}; {did_you_mean(name, known, 'there are')}")
-        noise[name] = int(value) if name == "pixels" else value
+        noise[name] = value
     given: dict[str, Any] = {"noise": NoiseModel(**noise)}
     if arguments.camera_angles is not None:
         given["camera_angles_deg"] = tuple(arguments.camera_angles)
     if arguments.tilt is not None:
         given["tilt_deg"] = arguments.tilt
     if arguments.sweep is not None:
-        if len(arguments.sweep) != 2 or not arguments.sweep[0] < arguments.sweep[1]:
-            raise RunError("--sweep: expected two angles in rising order, as in --sweep=-90,90")
+        if len(arguments.sweep) != 2:
+            raise RunError("--sweep: expected two angles, as in --sweep=-90,90")
         given["sweep_deg"] = tuple(arguments.sweep)
     return Rig(**given)
 
@@ -180,18 +186,23 @@ def _assigned(word: str, option: str) -> tuple[str, float]:
 
     name, _, text = word.partition("=")
     try:
-        number = part_of_one(text)
+        number = fraction(text)
     except ValueError:
         raise RunError(f"{option}: {word!r} is not of the form NAME=NUMBER or NAME=5%") from None
     return name, number
 
 
-def part_of_one(text: str) -> float:
-    """Return a finite number; one of 5% is 0.05."""
-    number = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+def finite(text: str) -> float:
+    """Return a finite number."""
+    number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"{text} is not finite")
     return number
+
+
+def fraction(text: str) -> float:
+    """Return a finite number; 5% is 0.05."""
+    return finite(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
 
 def word_list(text: str) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from .._common import print_table
+from ..model._models import plain
 
 if TYPE_CHECKING:
     from tvbrdf_fitting.design.search import Design, DesignStudy
@@ -23,7 +24,10 @@ def print_study(study: DesignStudy, trials: Sequence[Trial], source: str) -> Non
         what = "fewest images" + (", as simulated scans confirm" if trials else ", as predicted")
         print(f"* {what}\n" if not trials or trials[-1].reached else "")
     design = trials[-1].design if trials else study.fewest or study.largest
-    print(f"{_title(design)}:")
+    print(
+        f"Cameras: {_listed(design.cameras)}; lights: {design.lights}; "
+        f"exposures: {_listed(design.exposures_ms)} ms"
+    )
     more = ("simulated", "interval", "simulated/predicted") if trials else ()
     rows = _parameter_rows(study, design, trials[-1] if trials else None)
     print_table([*rows], (*_COLUMNS, *more))
@@ -44,12 +48,11 @@ def _design_rows(study: DesignStudy, trials: Sequence[Trial]) -> Iterator[dict[s
     """Yield designs with the fewest images first; those that were simulated with what came out."""
     simulated = {_key(trial.design): trial for trial in trials}
     designs = {_key(d): d for d in [*study.designs, *(trial.design for trial in trials)]}
-    chosen = trials[-1].design if trials else study.fewest
-    reached = not trials or trials[-1].reached
+    proposed = _proposed(study, trials)
     for key, design in sorted(designs.items(), key=lambda pair: pair[1].images):
         trial = simulated.get(key)
         yield {
-            "": "*" if reached and chosen is not None and key == _key(chosen) else "",
+            "": "*" if proposed is not None and key == _key(proposed) else "",
             "cameras": _listed(design.cameras),
             "exposures/ms": _listed(design.exposures_ms),
             "lights": design.lights,
@@ -68,32 +71,32 @@ def _parameter_rows(
     for place, name in enumerate(information.model.parameter_names):
         value = float(information.values[place])
         row = {"parameter": name, "value": f"{value:.4g}"}
-        if name in study.wanted:
-            row["wanted"] = f"{study.wanted[name]:.2g}"
-            row["predicted"] = f"{design.predicted.published[place]:.2g}"
-        else:
-            row["wanted"] = "fixed"
-        if trial is not None and name in trial.errors.names:
+        if name not in study.wanted:
+            yield row | {"wanted": "fixed"}
+            continue
+        wanted, predicted = study.wanted[name], design.predicted.published[place]
+        row["wanted"] = f"{wanted:.2g}" if math.isfinite(wanted) else "any"
+        row["predicted"] = f"{predicted:.2g}"
+        if trial is not None and math.isfinite(predicted):
             errors = trial.errors
             i = errors.names.index(name)
             row["simulated"] = f"{errors.simulated[i]:.2g}"
             row["interval"] = f"[{errors.low[i]:.2g}, {errors.high[i]:.2g}]"
-            ratio = errors.simulated[i] / errors.predicted[i]
+            ratio = errors.simulated[i] / predicted
             row["simulated/predicted"] = f"{ratio:.2f}{' b' if errors.at_bound[i] else ''}"
         yield row
 
 
-def _title(design: Design) -> str:
-    return (
-        f"Cameras {_listed(design.cameras)}; {design.lights} lights at "
-        f"{_listed(design.exposures_ms)} ms"
-    )
+def _proposed(study: DesignStudy, trials: Sequence[Trial]) -> Design | None:
+    """Return the last that was simulated, if it reached the accuracy; without any, the fewest."""
+    if not trials:
+        return study.fewest
+    return trials[-1].design if trials[-1].reached else None
 
 
 def _simulated_ratio(study: DesignStudy, trial: Trial) -> float:
-    wanted = [study.wanted[name] for name in trial.errors.names]
-    pairs = zip(trial.errors.simulated.tolist(), wanted, strict=True)
-    return max(float(error / allowed) for error, allowed in pairs)
+    pairs = zip(trial.errors.simulated.tolist(), study.wanted.values(), strict=True)
+    return max(float(error / allowed) for error, allowed in pairs if math.isfinite(allowed))
 
 
 def _key(design: Design) -> tuple[Any, ...]:
@@ -108,17 +111,15 @@ def as_dict(study: DesignStudy, trials: Sequence[Trial], source: str) -> dict[st
     """Return everything as plain Python types, numbers that are not finite as None."""
     information = study.information
     names = information.model.parameter_names
-    chosen = trials[-1].design if trials and trials[-1].reached else study.fewest
-    if trials and not trials[-1].reached:
-        chosen = None
+    proposed = _proposed(study, trials)
     return {
         "model": information.model.name,
         "source": source,
         "parameters": dict(zip(names, information.values.tolist(), strict=True)),
         "fixed": [*information.fixed],
-        "wanted": {name: _number(value) for name, value in study.wanted.items()},
+        "wanted": {name: plain(value) for name, value in study.wanted.items()},
         "designs": [_design_dict(study, design) for design in study.designs],
-        "fewest": None if chosen is None else _design_dict(study, chosen),
+        "fewest": None if proposed is None else _design_dict(study, proposed),
         "largest": _design_dict(study, study.largest),
         "simulated": [_trial_dict(study, trial) for trial in trials],
     }
@@ -133,10 +134,9 @@ def _design_dict(study: DesignStudy, design: Design) -> dict[str, Any]:
         "frames": design.frames,
         "images": design.images,
         "time_s": design.time_s,
-        "ratio": _number(design.ratio),
+        "ratio": plain(design.ratio),
         "predicted": {
-            name: _number(float(design.predicted.published[names.index(name)]))
-            for name in study.wanted
+            name: plain(design.predicted.published[names.index(name)]) for name in study.wanted
         },
     }
 
@@ -146,19 +146,14 @@ def _trial_dict(study: DesignStudy, trial: Trial) -> dict[str, Any]:
     return {
         "design": _design_dict(study, trial.design),
         "scans": errors.scans,
-        "seconds": errors.seconds,
         "reached": trial.reached,
         "errors": {
             name: {
-                "predicted": _number(float(errors.predicted[i])),
-                "simulated": _number(float(errors.simulated[i])),
-                "interval": [_number(float(errors.low[i])), _number(float(errors.high[i]))],
+                "predicted": plain(errors.predicted[i]),
+                "simulated": plain(errors.simulated[i]),
+                "interval": [plain(errors.low[i]), plain(errors.high[i])],
                 "at_bound": errors.at_bound[i],
             }
             for i, name in enumerate(errors.names)
         },
     }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -66,5 +66,5 @@ def values_of(model: ReflectanceModel, words: Iterable[str]) -> dict[str, float]
 
 
 def plain(value: float) -> Any:
-    """Return a bound as JSON can have it: None for none."""
+    """Return a number as JSON can have it: None for one that is not finite."""
     return float(value) if math.isfinite(value) else None

@@ -18,8 +18,8 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "check",
         run,
-        "check a model: reciprocity, sign, albedos, energy; status 1 if it creates energy or "
-        "breaks a promise",
+        "check a model: reciprocity, sign, albedos, energy; status 1 if it creates energy, breaks "
+        "a promise or is outside its bounds",
     )
     parser.add_argument("name", help="a model, a sum or an alias, e.g. oren_nayar or ON+TS")
     parser.add_argument(
@@ -75,16 +75,16 @@ def _print(report: ModelReport) -> None:
         print(f"  {name} = {value:g}")
     for kind in dict.fromkeys(row.kind for row in report.albedo):
         what = "light" if kind.startswith("directional") else "view"
+        what += " (or view: it is reciprocal)" if report.reciprocal else ""
         print(f"\nAlbedo, {kind}, against the angle of the {what} in degrees")
         rows = [_row(row, report) for row in report.albedo if row.kind == kind]
         print_table(rows, [*rows[0]])
     names = ("B", "G", "R")
     whole = zip(names, report.bihemispherical, report.bihemispherical_error, strict=True)
-    print(
-        f"\nBihemispherical reflectance: {', '.join(f'{n} {v:.6f} ± {e:.0e}' for n, v, e in whole)}"
-    )
+    told = ", ".join(f"{n} {v:#.6g} ± {e:.0e}" for n, v, e in whole)
+    print(f"\nBihemispherical reflectance: {told}")
     largest = zip(names, report.largest_albedo, strict=True)
-    print(f"Largest albedo: {', '.join(f'{n} {v:.4f}' for n, v in largest)}")
+    print(f"Largest albedo: {', '.join(f'{n} {v:#.5g}' for n, v in largest)}")
     print(f"Exchange of light and view changes it by at most {report.reciprocity_defect.value:.1e}")
     print(f"Smallest value: {report.smallest.value:.3g} 1/sr")
     print()
@@ -97,7 +97,7 @@ def _row(row: AlbedoRow, report: ModelReport) -> dict[str, Any]:
     where = {"angle": f"{row.theta_deg:g}"}
     if not report.isotropic:
         where["azimuth"] = f"{row.phi_deg:g}"
-    values = {name: f"{value:.8f}" for name, value in zip("BGR", row.value, strict=True)}
+    values = {name: f"{value:#.8g}" for name, value in zip("BGR", row.value, strict=True)}
     return {**where, **values, "error": f"{max(row.error):.0e}"}
 
 
