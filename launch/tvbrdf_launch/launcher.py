@@ -15,6 +15,8 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from tvbrdf_nodes.core.node import GIVE_UP
+
 from .display import Display
 from .errors import RunError
 from .node_process import NodeProcess, describe_exit
@@ -62,6 +64,8 @@ class Launcher:
         self._nodes = {n.name: NodeProcess(n, self._run) for n in plan.nodes}
         self._silent = {n for n in self._nodes if "/diagnostics" not in plan.graph.find(n).gives}
         """Nodes that can't say how they are."""
+        self._counted = {p.name for p in plan.graph.participants if p.counted_bytes}
+        """Nodes for which nobody waits: once they have run, the run goes on without them."""
         self._table = ProcessTable(ProcessRecord(os.getpid(), start_ticks(os.getpid())))
         self._code = OK
         self._interrupts = 0
@@ -250,7 +254,13 @@ class Launcher:
         by_itself = code > 0
         if by_itself and not node.has_run and node.name not in self._silent:
             self._fail(f"node {node.name} failed at start ({describe_exit(code)})", node)
-        elif node.plan.restart.policy == "never" or (by_itself and node.plan.ends_run):
+        elif node.plan.restart.policy == "never" and node.name in self._counted:
+            self._go_on_without(node, what)
+        elif (
+            node.plan.restart.policy == "never"
+            or code == GIVE_UP
+            or (by_itself and node.plan.ends_run)
+        ):
             self._fail(what, node)
         else:
             self._restart(node, f"failed ({describe_exit(code)})")
@@ -262,13 +272,20 @@ class Launcher:
             node.restarts = 0
         if node.restarts >= policy.max_restarts:
             times = f"{node.restarts} restarts" if node.restarts != 1 else "1 restart"
-            self._fail(f"node {node.name} {what} after {times}", node)
+            text = f"node {node.name} {what} after {times}"
+            if node.name in self._counted:
+                self._go_on_without(node, text)
+            else:
+                self._fail(text, node)
             return
         node.restarts += 1
         self._display.say(
             f"node {node.name} {what}; restart {node.restarts} of {policy.max_restarts}"
         )
         self._restarts_due[node.name] = now + policy.delay_s
+
+    def _go_on_without(self, node: NodeProcess, text: str) -> None:
+        self._report(f"{text}; the run goes on without it", node)
 
     def _take_end(self, node: NodeProcess, code: int) -> None:
         """Take note of the end of a node while the run is being stopped."""

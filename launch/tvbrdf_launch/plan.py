@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +36,20 @@ class Plan:
     launch: LaunchFile
     graph: Graph
     nodes: tuple[PlannedNode, ...]
+    notices: tuple[str, ...] = ()
+    """What people should know before it is carried out."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Checked:
     entry: NodeEntry
+    cls: type[Node[Any]]
+    parameters: Any
     participants: tuple[Participant, ...]
     drives_real_device: bool
     speedup: float | None
+    selects: Callable[[str], bool] | None
+    """Says which topics that others give the node takes besides."""
 
 
 def make_plan(launch: LaunchFile, run: Path) -> Plan:
@@ -58,7 +64,7 @@ def make_plan(launch: LaunchFile, run: Path) -> Plan:
     if not launch.nodes:
         raise LaunchError("it starts no node", Place(launch.path, 0))
     checked = [_check_node(entry) for entry in launch.nodes]
-    participants = tuple(p for each in checked for p in each.participants)
+    participants = tuple(_with_selected(checked))
     topics = {topic for p in participants for topic in p.gives}
     simulated = "/clock" in topics and not any(
         each.drives_real_device and not _reaches_twin(each, topics, run) for each in checked
@@ -73,7 +79,30 @@ def make_plan(launch: LaunchFile, run: Path) -> Plan:
     )
     _check_graph(graph, checked)
     nodes = tuple(PlannedNode(e.name, e.restart, e.ends_run) for e in launch.nodes)
-    return Plan(launch, graph, nodes)
+    return Plan(launch, graph, nodes, tuple(_notices(graph, checked)))
+
+
+def _with_selected(checked: list[_Checked]) -> Iterator[Participant]:
+    """Yield all participants, each with the topics of others that its node selects."""
+    given = [(p.name, topic) for each in checked for p in each.participants for topic in p.gives]
+    for each in checked:
+        for participant in each.participants:
+            if each.selects is None or not participant.node:
+                yield participant
+                continue
+            others = {topic for name, topic in given if name != participant.name}
+            also = sorted(filter(each.selects, others - set(participant.takes)))
+            yield replace(participant, takes=(*participant.takes, *also))
+
+
+def _notices(graph: Graph, checked: list[_Checked]) -> Iterator[str]:
+    for each in checked:
+        name = each.entry.name
+        try:
+            for text in each.cls.notices(name, each.parameters, graph):
+                yield f"{name}: {text}"
+        except ValueError as error:
+            raise LaunchError(f"node {name}: {error}", each.entry.place) from error
 
 
 def _check_node(entry: NodeEntry) -> _Checked:
@@ -100,12 +129,13 @@ def _check_node(entry: NodeEntry) -> _Checked:
         driver=driver_path if driver else "",
         parameters=entry.parameters.plain(),
         live=live,
+        counted_bytes=use.counted_bytes,
     )
     found = [me]
     if link is not None:
         found.append(Participant(name=f"{entry.name}.device", takes=link.takes, gives=link.gives))
     speedup = getattr(parameters, "speedup", None)
-    return _Checked(entry, tuple(found), live, speedup)
+    return _Checked(entry, cls, parameters, tuple(found), live, speedup, use.selects)
 
 
 def _load(path: str, place: Place, what: str) -> type[Any]:

@@ -27,12 +27,6 @@ def start_ticks(pid: int) -> int:
     return int(fields[19]) if fields else 0
 
 
-def process_state(pid: int) -> str:
-    """Return the kernel's letter for a process's state (``T``: stopped); empty if it is gone."""
-    fields = _stat_fields(pid)
-    return fields[0] if fields else ""
-
-
 def _stat_fields(pid: int) -> list[str]:
     """Return the fields of /proc/PID/stat after the command's name."""
     try:

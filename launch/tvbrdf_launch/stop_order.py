@@ -2,7 +2,9 @@
 
 It follows from the graph alone: who commands or moves the light (gives ``/scan/command`` or
 ``/arm/state``) goes first, then everybody after those whose lossless messages they read, and last
-the simulated world with the controller's twin, which the arm needs to the end.
+the simulated world with the controller's twin, which the arm needs to the end. For what a database
+(gives ``/scan/stored``) sends back of what it holds, nobody waits: it is stored already. Who only
+listens, as a recorder does, goes after everybody that it hears, but for the world.
 """
 
 from __future__ import annotations
@@ -11,6 +13,8 @@ from tvbrdf_messages.run_directory import Graph
 from tvbrdf_messages.topics import LOSSLESS, find_topic
 
 _FIRST = {"/scan/command", "/arm/state"}
+_STORED = "/scan/stored"
+_OF_EVERYBODY = {"/diagnostics", "/log"}
 
 
 def stop_stages(graph: Graph) -> tuple[tuple[str, ...], ...]:
@@ -22,13 +26,15 @@ def stop_stages(graph: Graph) -> tuple[tuple[str, ...], ...]:
         for p in nodes
         if p.name not in first and any(t.startswith("/sim/") for t in (*p.takes, *p.gives))
     }
+    stores = {p.name for p in nodes if _STORED in p.gives}
+    listeners = {p.name for p in nodes if set(p.gives) <= _OF_EVERYBODY} - world
     sources = {
         p.name: {
             publisher
             for topic in p.takes
-            if find_topic(topic).quality == LOSSLESS
+            if p.name in listeners or find_topic(topic).quality == LOSSLESS
             for publisher in graph.publishers(topic)
-            if publisher != p.name
+            if publisher != p.name and (p.name in listeners or publisher not in stores)
         }
         for p in nodes
     }

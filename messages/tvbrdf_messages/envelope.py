@@ -40,6 +40,23 @@ class Envelope(NamedTuple):
         return (self.topic, self.header.publisher, self.header.incarnation, self.header.sequence)
 
 
+_EPOCH_MARK = "~"
+
+
+def in_epoch(incarnation: str, epoch: int) -> str:
+    """Return a recorded incarnation as it is played in a later epoch (after a loop or a seek).
+
+    A message tells its epoch itself: ``/clock`` has no order with other topics.
+    """
+    return f"{incarnation}{_EPOCH_MARK}{epoch}"
+
+
+def epoch_of(incarnation: str) -> int:
+    """Return the epoch in which a recorded message is played again; 0: no clock has jumped."""
+    epoch = incarnation.rpartition(_EPOCH_MARK)[2] if _EPOCH_MARK in incarnation else ""
+    return int(epoch) if epoch.isdecimal() else 0
+
+
 def new_incarnation() -> str:
     """Return a name for one life of a process; a restarted one gets another."""
     return uuid.uuid4().hex[:12]

@@ -232,7 +232,7 @@ class Stored(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatabaseState(Message):
-    """What a database holds when it is opened; latched, so a restarted sequencer goes on there."""
+    """What a database holds, told at every change; latched: a restarted sequencer goes on there."""
 
     sample: str
     scans: tuple[int, ...]

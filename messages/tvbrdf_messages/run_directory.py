@@ -31,6 +31,9 @@ class Participant:
     parameters: dict[str, Any] = field(default_factory=dict)
     live: bool = False
     """A live source never waits for a slow reader: its sweep is broken instead."""
+    counted_bytes: int = 0
+    """Above 0: a counted reader, which nobody waits for. Each publisher has so many bytes on the
+    way to it at most; what does not fit is left out, and the reader sees the gap."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,6 +90,8 @@ class Graph:
                     and participant.node
                     and not participant.node.startswith("tvbrdf_nodes.world")
                     and ".simulated" not in participant.node
+                    # a player reads nothing of it, and tells what was recorded when asked to
+                    and not participant.node.startswith("tvbrdf_nodes.player.")
                 ):
                     raise BusError(f"node {participant.name} may not touch {name}: real nodes "
                                    "must not know that they are simulated")  # fmt: skip

@@ -7,16 +7,16 @@ import json
 import signal
 import subprocess
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from tests.paths import CALIBRATION_FILE
 from tvbrdf_launch.cli import parser
 
 if TYPE_CHECKING:
-    from conftest import Run
+    from tests.launch.conftest import Run
 
 pytestmark = pytest.mark.system
 
@@ -217,13 +217,7 @@ def test_topic_bw_and_delay(run: Run) -> None:
 @pytest.mark.parametrize("verb", ["echo", "hz"])
 def test_ctrl_c_ends_watching_quietly(run: Run, verb: str) -> None:
     run.ready()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tvbrdf_launch", "topic", verb, "/arm/state"],
-        env=run.environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = run.popen("topic", verb, "/arm/state", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stdout.readline()
     process.send_signal(signal.SIGINT)
@@ -234,12 +228,8 @@ def test_ctrl_c_ends_watching_quietly(run: Run, verb: str) -> None:
 
 def test_a_closed_pipe_is_quiet(run: Run) -> None:
     run.ready()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tvbrdf_launch", "topic", "echo", "/arm/state"],
-        env=run.environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+    process = run.popen(
+        "topic", "echo", "/arm/state", stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     assert process.stdout is not None
     assert process.stderr is not None
@@ -252,12 +242,8 @@ def test_a_closed_pipe_is_quiet(run: Run) -> None:
 
 def test_echo_ends_with_the_run(run: Run) -> None:
     run.ready()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tvbrdf_launch", "topic", "echo", "/arm/state"],
-        env=run.environment,
-        stdout=subprocess.DEVNULL,
-    )
-    run.interrupt()
+    process = run.popen("topic", "echo", "/arm/state", stdout=subprocess.DEVNULL)
+    run.signal()
     assert process.wait(15) == 0
 
 
@@ -283,7 +269,7 @@ def test_node_list_and_info(run: Run) -> None:
 
 def test_an_ended_run_can_still_be_looked_at(run: Run) -> None:
     folder = run.ready()
-    run.interrupt()
+    run.signal()
     assert run.wait() == 130
     assert {row["state"] for row in parsed(run, "node", "list")} == {"ended"}
     assert parsed(run, "node", "info", "arm")["exit_code"] == 0
@@ -331,9 +317,8 @@ def test_preview(run: Run) -> None:
     import cv2
     import OpenEXR
 
-    path = Path(__file__).parents[2] / "launch" / "calibration.yaml"
     merger = "  - name: merger\n    node: launch_test_nodes:Merger\n"
-    merger += f"    parameters: {{calibration: {path}}}\n"
+    merger += f"    parameters: {{calibration: {CALIBRATION_FILE}}}\n"
     folder = run.ready(run.rig + CAMERAS + merger)
     found = parsed(run, "preview", "--out", "stills")
     assert [(s["camera"], s["exposure_ms"]) for s in found["stills"]] == [

@@ -8,14 +8,13 @@ import random
 import signal
 import stat
 import subprocess
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 if TYPE_CHECKING:
-    from conftest import Run
+    from tests.launch.conftest import Run
 
 pytestmark = pytest.mark.system
 
@@ -84,7 +83,7 @@ def test_the_run_directory_is_private_and_tells_all(run: Run) -> None:
         assert threads | {b"PYTHONUNBUFFERED=1"} <= set(variables)
         assert Path(f"/proc/{pid}/fd/0").readlink().name.startswith("pipe:")
         assert (folder / f"{name}.log").exists()
-    run.interrupt()
+    run.signal()
     assert run.wait() == 130
     assert not [path for path in folder.iterdir() if path.is_socket()]
     run.expect_no_process()
@@ -178,7 +177,7 @@ def test_a_node_that_gives_up_ends_the_run_although_it_may_be_restarted(run: Run
 def test_signals_stop_in_order(run: Run, number: signal.Signals, code: int) -> None:
     folder = run.launch(CHAIN)
     run.wait_event(folder, "writer", "first:fitter")
-    run.interrupt(number)
+    run.signal(number)
     assert run.wait() == code
     stopped = times(run, folder, "stop")
     assert sorted(stopped, key=stopped.__getitem__) == ["arm", "fitter", "writer"]
@@ -191,9 +190,9 @@ def test_a_hanging_node_is_killed_in_the_end(run: Run) -> None:
         CHAIN.replace("takes: [/arm/state],", "takes: [/arm/state], hang_in_stop: true,")
     )
     run.wait_event(folder, "writer", "first:fitter")
-    run.interrupt()
+    run.signal()
     run.wait_event(folder, "fitter", "stop")
-    run.interrupt()  # hurry
+    run.signal()  # hurry
     assert run.wait() == 130
     assert "fitter does not stop; SIGTERM" in run.text()
     assert "fitter does not stop; SIGKILL" in run.text()
@@ -208,7 +207,7 @@ def test_a_third_interrupt_kills_at_once(run: Run) -> None:
     )
     run.wait_event(folder, "writer", "first:fitter")
     for said in ("once more: hurry", "once more: kill", "arm does not stop; SIGKILL"):
-        run.interrupt()
+        run.signal()
         run.wait_text(said)
     assert run.wait(5) == 130
     run.expect_no_process()
@@ -231,7 +230,7 @@ def test_no_orphan_is_left_when_the_launcher_is_killed(run: Run) -> None:
         CHAIN.replace("gives: [/arm/state]", "gives: [/arm/state], hang_in_stop: true")
     )
     run.wait_event(folder, "writer", "first:fitter")
-    run.interrupt(signal.SIGKILL)
+    run.signal(signal.SIGKILL)
     assert run.wait() == -signal.SIGKILL
     run.expect_no_process()
     assert {"arm", "fitter", "writer"} == set(times(run, folder, "stop"))
@@ -246,7 +245,7 @@ def test_what_a_node_started_goes_with_it(run: Run) -> None:
     os.kill(run.table(folder)["nodes"]["source"]["pid"], signal.SIGKILL)
     run.wait_event(folder, "source", "start", 2)
     assert len(run.processes()) == 4, "the killed node's child is gone too"
-    run.interrupt()
+    run.signal()
     assert run.wait() == 130
     run.expect_no_process()
 
@@ -256,19 +255,12 @@ def test_an_interrupt_at_any_moment_leaves_nothing(run: Run, seed: int) -> None:
     path = run.write(CHAIN)
     number = (signal.SIGINT, signal.SIGKILL)[seed % 2]
     after_s = random.Random(seed).uniform(0.0, 1.5)
-    with run.output.open("w") as output:
-        run.process = subprocess.Popen(
-            [sys.executable, "-m", "tvbrdf_launch", "launch", str(path)],
-            env=run.environment,
-            stdout=output,
-            stderr=output,
-            stdin=subprocess.DEVNULL,
-            text=True,
-        )
+    run.start(str(path))
+    assert run.process is not None
     try:
         assert run.process.wait(after_s) is None
     except subprocess.TimeoutExpired:
-        run.interrupt(number)
+        run.signal(number)
     assert run.wait() in ((130, -signal.SIGINT) if number == signal.SIGINT else (-number,))
     run.expect_no_process()
 
@@ -276,13 +268,7 @@ def test_an_interrupt_at_any_moment_leaves_nothing(run: Run, seed: int) -> None:
 def test_a_closed_pipe_does_not_end_the_run(run: Run) -> None:
     path = run.write(CHAIN.replace("gives: [/arm/state]", "gives: [/arm/state], exit_after_s: 0.5")
                      + "    on_exit: shutdown\n")  # fmt: skip
-    run.process = subprocess.Popen(
-        [sys.executable, "-m", "tvbrdf_launch", "launch", str(path)],
-        env=run.environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    run.process = run.popen("launch", str(path), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert run.process.stdout is not None
     assert run.process.stderr is not None
     run.process.stdout.close()
@@ -335,7 +321,7 @@ def test_a_directory_in_use_open_or_foreign_is_refused(run: Run) -> None:
     for result in (busy, refused):
         assert len(result.stderr.splitlines()) == 1
     assert list(foreign.iterdir()) == [foreign / "thesis.tex"]
-    run.interrupt()
+    run.signal()
     run.wait()
 
 
@@ -362,7 +348,7 @@ def test_old_runs_are_removed_but_never_one_that_goes_on(run: Run) -> None:
     runs = [p for p in (run.runtime / "tvbrdf").iterdir() if not p.is_symlink()]
     assert folder in runs
     assert len(runs) == 3
-    run.interrupt()
+    run.signal()
     run.wait()
 
 

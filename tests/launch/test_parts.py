@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.paths import CALIBRATION_FILE
 from tvbrdf_fitting.measurement.calibration import load_calibration
 from tvbrdf_launch.display import Display, TimeLeft
 from tvbrdf_launch.errors import RunError
@@ -28,9 +29,6 @@ from tvbrdf_launch.still import BINS, bars, figures, merge_exposures, write_exr
 from tvbrdf_launch.text import duration, plus_minus, size
 from tvbrdf_messages.envelope import Envelope, Header
 from tvbrdf_messages.messages import Diagnostics, Frame, Log, ScanStatus
-
-CALIBRATION = Path(__file__).parents[2] / "launch" / "calibration.yaml"
-
 
 # -- numbers as text
 
@@ -213,7 +211,7 @@ def test_figures_count_every_pixel() -> None:
 
 
 def test_merged_exposures_are_the_radiance_within_its_noise() -> None:
-    camera = load_calibration(CALIBRATION).camera(1)
+    camera = load_calibration(CALIBRATION_FILE).camera(1)
     generator = np.random.default_rng(7)
     scale = np.asarray(camera.radiance_per_dn_per_ms)
     radiance = np.broadcast_to(np.geomspace(0.002, 5.0, 400)[None, :, None], (100, 400, 3))
@@ -244,7 +242,7 @@ def test_merged_exposures_are_the_radiance_within_its_noise() -> None:
 
 
 def test_where_all_is_saturated_the_shortest_exposure_bounds_it() -> None:
-    camera = load_calibration(CALIBRATION).camera(1)
+    camera = load_calibration(CALIBRATION_FILE).camera(1)
     codes = np.full((2, 2, 3), 4095, dtype=np.uint16)
     merged, known = merge_exposures([frame(codes, 4.0), frame(codes, 0.2)], camera)
     assert not known.any()

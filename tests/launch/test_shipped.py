@@ -117,7 +117,7 @@ def test_every_declared_argument_is_used() -> None:
 
 
 def test_every_argument_and_file_is_described() -> None:
-    assert set(shipped()) == {"simulated_rig", "rig", "pipeline"}
+    assert set(shipped()) == {"simulated_rig", "rig", "pipeline", "play", "replay"}
     for name, declaration in shipped().items():
         assert declaration.description, name
         for argument in declaration.arguments.values():

@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 import pty
 import signal
-import subprocess
-import sys
 import time
 from typing import TYPE_CHECKING
 
 import pytest
 
 if TYPE_CHECKING:
-    from conftest import Run
+    from tests.launch.conftest import Run
 
 pytestmark = pytest.mark.system
 
@@ -52,7 +50,7 @@ def test_stop_kills_an_arm_node_that_does_not_react(run: Run) -> None:
 
 def test_stop_works_when_the_launcher_is_gone(run: Run) -> None:
     run.ready(run.rig.replace("gives: [/arm/state]", "gives: [/arm/state], hang_in_stop: true"))
-    run.interrupt(signal.SIGKILL)
+    run.signal(signal.SIGKILL)
     run.wait()
     good(run, "stop")
     assert run.processes() == []
@@ -61,11 +59,11 @@ def test_stop_works_when_the_launcher_is_gone(run: Run) -> None:
 def test_stop_tells_what_it_could_not_stop(run: Run) -> None:
     folder = run.ready()
     assert run.process is not None
-    run.interrupt(signal.SIGSTOP)  # a launcher that hangs
+    run.signal(signal.SIGSTOP)  # a launcher that hangs
     result = run.tvbrdf("stop", "--timeout", "0.5")
     assert result.returncode == 1
     assert f"launcher (pid {run.process.pid})" in result.stderr
-    run.interrupt(signal.SIGCONT)
+    run.signal(signal.SIGCONT)
     assert run.wait() == 130
     assert run.table(folder)["state"] == "ended"
 
@@ -84,14 +82,8 @@ def test_the_progress_bar_on_a_terminal(run: Run) -> None:
         """
     )
     here, there = pty.openpty()
-    run.process = subprocess.Popen(
-        [sys.executable, "-m", "tvbrdf_launch", "launch", str(path)],
-        env={**run.environment, "TERM": "xterm", "COLUMNS": "120"},
-        stdin=there,
-        stdout=there,
-        stderr=there,
-        text=True,
-    )
+    run.environment |= {"TERM": "xterm", "COLUMNS": "120"}
+    run.process = run.popen("launch", str(path), stdin=there, stdout=there, stderr=there)
     os.close(there)
     shown = b""
     try:

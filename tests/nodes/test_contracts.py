@@ -29,6 +29,8 @@ REQUIRED: dict[str, dict[str, Any]] = {
     "hdr_merger": {"calibration": CALIBRATION, "cameras": ["camera_1"]},
     "database_writer": {"path": "db", "sample": "paint"},
     "sequencer": {"sample": "paint"},
+    "recorder": {"path": "bag"},
+    "player": {"bag": "run.mcap", "topics": ["/arm/state", "/replay/command"]},
 }
 """Parameters that a node can't be without."""
 SIMULATION = ("world", "arm_controller")

@@ -86,10 +86,10 @@ def test_everything_comes_back(tmp_path: Path) -> None:
         assert store.store_missing(2, "the arm did\nnot answer", time_s=120.0) == "stored"
         assert store.store_parameters(fit_record(3)) == "stored"
         assert store.store_note(START_NS, "painted", zero=True) == "stored"
-        assert store.stored_scans() == (1, 3)
-        assert store.fitted_scans() == (3,)
-        assert store.missing_scans() == {2: "the arm did not answer"}
-        assert store.zero_ns() == START_NS
+        assert store.contents().scans == (1, 3)
+        assert store.contents().fitted == (3,)
+        assert store.contents().missing == {2: "the arm did not answer"}
+        assert store.contents().zero_ns == START_NS
 
     (sample,) = read_database(path).samples
     assert (sample.name, sample.process, sample.run_id) == ("blue_paint", "drying paint", "r1")
@@ -166,7 +166,7 @@ def test_fits_without_a_place_in_the_layout_are_in_the_catalogue_only(tmp_path: 
             store.store_scan(scan_record(scan))
         store.store_parameters(replace(fit_record(1), values=unknown))
         store.store_parameters(fit_record(2))
-        assert store.fitted_scans() == (1, 2)
+        assert store.contents().fitted == (1, 2)
     sample = read_sample(tmp_path / "sample01")
     assert sample.parameter_scans == (2,)
     fit = read_database(tmp_path).samples[0].scans[0].fit
@@ -229,20 +229,20 @@ def test_a_scan_that_was_missing_may_come_late(tmp_path: Path) -> None:
     with DatabaseStore(tmp_path, "blue_paint") as store:
         store.store_missing(1, "merger was killed")
         assert store.store_scan(scan_record(1)) == "stored"
-        assert store.missing_scans() == {}
-        assert store.stored_scans() == (1,)
+        assert store.contents().missing == {}
+        assert store.contents().scans == (1,)
     (note,) = read_database(tmp_path).samples[0].notes
     assert note.text == "scan 1 came after it was recorded as missing: merger was killed"
 
 
 def test_time_zero_comes_from_a_mark_or_from_the_first_scan(tmp_path: Path) -> None:
     with DatabaseStore(tmp_path, "blue_paint") as store:
-        assert store.zero_ns() == 0
+        assert store.contents().zero_ns == 0
         store.store_scan(scan_record(2))
-        assert store.zero_ns() == START_NS
+        assert store.contents().zero_ns == START_NS
         store.store_note(START_NS - 5, "painted", zero=True)
         store.store_note(START_NS + 7, "a fly sat down")
-        assert store.zero_ns() == START_NS - 5
+        assert store.contents().zero_ns == START_NS - 5
 
 
 def test_a_database_that_is_not_empty_is_refused_unless_resumed(tmp_path: Path) -> None:
@@ -257,7 +257,7 @@ def test_a_database_that_is_not_empty_is_refused_unless_resumed(tmp_path: Path) 
     for own in ({"resume": True}, {"run_id": "r1"}):  # a restarted writer finds its own
         options: dict[str, Any] = dict(own)
         with DatabaseStore(tmp_path, "blue_paint", **options) as store:
-            assert store.stored_scans() == (1,)
+            assert store.contents().scans == (1,)
             assert store.store_scan(scan_record(1)) == "already_stored"
 
 
@@ -310,7 +310,7 @@ def test_records_that_cannot_be_stored_are_refused(
         before = contents(tmp_path)
         with pytest.raises(DatabaseError, match=problem):
             store.store_scan(replace(scan_record(1), **change))
-        assert store.stored_scans() == ()
+        assert store.contents().scans == ()
         assert contents(tmp_path) == before
 
 
@@ -335,7 +335,7 @@ def test_fits_that_cannot_be_stored_are_refused(
         store.store_parameters(fit_record(3))
         with pytest.raises(DatabaseError, match=problem):
             store.store_parameters(replace(fit_record(1), **change))
-        assert store.fitted_scans() == (3,)
+        assert store.contents().fitted == (3,)
 
 
 def test_damage_is_named(tmp_path: Path) -> None:

@@ -283,7 +283,7 @@ def test_full_catalogue_is_told_and_overcome(tmp_path: Path) -> None:
             store.store_scan(replace(scan_record(2), quality={"gaps": "x" * 5000}))
         event.remove(store._engine, "begin", small)
         event.listen(store._engine, "begin", large)
-        assert store.stored_scans() == (1,)
+        assert store.contents().scans == (1,)
         assert store.store_scan(scan_record(2)) == "stored"
         event.remove(store._engine, "begin", large)
     assert has(tmp_path) >= {"scan 1", "late scan 2"}
@@ -312,8 +312,8 @@ def fill_the_disk(folder: Path) -> int:
 
         with pytest.raises(DiskFullError, match=r"storing scan \d+ failed: the disk is full"):
             store_scans()
-        stored = len(store.stored_scans())
-        assert store.stored_scans() == tuple(range(1, stored + 1))
+        stored = len(store.contents().scans)
+        assert store.contents().scans == tuple(range(1, stored + 1))
         with suppress(DiskFullError):  # this little may still find a place
             store.store_parameters(fit_record(1))
         filler.unlink()

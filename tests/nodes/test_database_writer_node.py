@@ -152,8 +152,8 @@ class Desk:
         return self.stage.players["sequencer"].take(Stored)
 
     def state(self) -> DatabaseState:
-        (state,) = self.stage.players["sequencer"].take(DatabaseState)
-        return state
+        (self.last_state,) = self.stage.players["sequencer"].take(DatabaseState)
+        return self.last_state
 
     def sample(self) -> StoredSample:
         (sample,) = read_database(self.path).samples
@@ -206,6 +206,7 @@ def test_what_was_seen_is_kept_bit_for_bit(desk: Desk) -> None:
     assert scan.quality["gain_relative_std"] == 1e-3
     assert scan.quality["frame_relative_std"] == [1e-3] * 4
     assert scan.quality["lamp_factor"] == [1.0, 2.0]
+    assert (scan.quality["attempt"], scan.quality["cameras"]) == (1, list(CAMERAS))
     assert (scan.start_stamp_ns, scan.time_s) == (ZERO_NS, 0.0)
 
 
@@ -280,6 +281,114 @@ def test_its_state_tells_t_0_and_the_latest_scan(desk: Desk, make_stage: MakeSta
     assert (state.scans, state.missing) == ((1,), (4,))
     assert state.zero_ns == ZERO_NS - 30_000_000_000
     assert state.last_ns == state.zero_ns + 180_000_000_000
+
+
+def test_its_state_is_always_what_it_holds(desk: Desk) -> None:
+    """It is latched: a sequencer that is restarted goes on from it."""
+    desk.state()
+    desk.merge(1)
+    assert (desk.state().scans, desk.last_state.fitted) == ((1,), ())
+    desk.fit(1)
+    assert (desk.state().scans, desk.last_state.fitted) == ((1,), (1,))
+    desk.miss(2)
+    assert desk.state().missing == (2,)
+    desk.mark("painted", ZERO_NS - 30_000_000_000, zero=True)
+    assert desk.state().zero_ns == ZERO_NS - 30_000_000_000
+    desk.fit(1)  # nothing new
+    assert desk.stage.players["sequencer"].take(DatabaseState) == []
+
+
+# -- what is stored and not fitted
+
+
+def sent_back(desk: Desk) -> dict[int, Radiance]:
+    """Return the radiance that the database has sent, by scan."""
+    found = {}
+    for envelope in desk.stage.said("/scan/radiance"):
+        if envelope.header.publisher == "database_writer":
+            assert isinstance(envelope.message, Radiance)
+            found[envelope.message.scan] = envelope.message
+    return found
+
+
+def expect_same(found: Radiance, sent: Radiance) -> None:
+    for part in Radiance.schema():
+        one, other = getattr(found, part.name), getattr(sent, part.name)
+        if part.array:
+            assert (one.dtype, one.shape) == (other.dtype, other.shape), part.name
+            assert one.tobytes() == other.tobytes(), part.name
+        else:
+            assert one == other, part.name
+
+
+def test_what_was_not_fitted_is_sent_again_as_it_came(desk: Desk, make_stage: MakeStage) -> None:
+    for scan in (1, 2, 4):
+        desk.merge(scan, attempt=scan)
+    desk.fit(2)
+    desk.miss(3)
+    assert sent_back(desk) == {}
+    desk.stage.end()
+    later_ns = desk.stage.graph.bus.graph.utc_ns + 1
+    again = Desk(make_stage, desk.path, utc_ns=later_ns, resume=True)
+    found = sent_back(again)
+    assert sorted(found) == [1, 4]
+    assert {message.scan for message in again.stage.players["fitter"].take(Radiance)} == {1, 4}
+    for scan, message in found.items():
+        expect_same(message, radiance(scan, attempt=scan))
+    assert again.fit(1) == [stored(1, "parameters")]
+    assert again.fit(4) == [stored(4, "parameters")]
+    assert [scan.fit is not None for scan in again.sample().scans] == [True] * 3
+
+
+@pytest.mark.parametrize("name", ["fitter", "sequencer"])
+def test_it_is_sent_again_to_a_fitter_that_was_restarted(desk: Desk, name: str) -> None:
+    """Its merger may have been lost with it; the sequencer may wait for it."""
+    desk.merge(1)
+    desk.merge(2)
+    desk.fit(1)
+    player = desk.stage.players[name]
+    player.die()
+    player.return_()
+    assert sorted(sent_back(desk)) == [2]
+
+
+def test_who_needs_no_radiance_starts_nothing(desk: Desk) -> None:
+    desk.merge(1)
+    desk.stage.players["hdr_merger"].die()
+    desk.stage.players["hdr_merger"].return_()
+    assert sent_back(desk) == {}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "text"),
+    [
+        (lambda arrays: arrays.pop("valid"), "'valid' is missing"),
+        (
+            lambda arrays: arrays.update(radiance=arrays["radiance"][:, :2]),
+            "radiance: shape (120, 2), expected n×3",
+        ),
+    ],
+)
+def test_observations_that_are_not_whole_are_told_and_the_others_sent(
+    desk: Desk, make_stage: MakeStage, spoil: Callable[[dict[str, Any]], Any], text: str
+) -> None:
+    desk.merge(1)
+    desk.merge(2)
+    desk.stage.end()
+    first = desk.sample().scans[0]
+    arrays = first.observations()
+    spoil(arrays)
+    size = first.observations_path.stat().st_size
+    np.savez(first.observations_path, **arrays)  # type: ignore[arg-type]
+    with first.observations_path.open("ab") as file:  # a size that the catalogue knows
+        file.write(bytes(size - first.observations_path.stat().st_size))
+    again = Desk(make_stage, desk.path, resume=True)
+    assert sorted(sent_back(again)) == [2]
+    answer = again.confirmed()[0]
+    assert (answer.scan, answer.what, answer.already) == (1, "parameters", False)
+    assert str(first.observations_path) in answer.refused
+    assert text in answer.refused
+    assert answer.refused in again.stage.log("error")
 
 
 # -- what can't be stored

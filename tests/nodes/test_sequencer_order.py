@@ -111,6 +111,31 @@ def test_nothing_moves_before_all_nodes_run_and_the_database_is_open(rig: Rig) -
     assert rig.actions()[0] == "home"
 
 
+def test_it_begins_while_the_fitter_still_loads(rig: Rig) -> None:
+    """What is sent to a fitter that has registered waits for it; one that has not loses it."""
+    for name in ("arm", "camera_1", "camera_2", "hdr_merger", "database_writer"):
+        rig[name].state()
+    rig.database()
+    rig["fitter"].state("waiting")
+    rig.play()
+    assert rig.commands == []
+    rig["fitter"].state("ready")
+    rig.play()
+    assert rig.actions()[0] == "home"
+    rig["fitter"].state()
+    assert rig.play_to_end() == Exit(0)
+    assert rig.sweeps() == [(scan, sweep, 1) for scan in (1, 2) for sweep in range(3)]
+
+
+@pytest.mark.parametrize("name", ["arm", "camera_1", "hdr_merger", "database_writer"])
+def test_it_begins_only_when_all_others_have_loaded(rig: Rig, name: str) -> None:
+    rig.all_running()
+    rig[name].state("ready")
+    rig.database()
+    rig.play()
+    assert rig.commands == []
+
+
 def test_a_node_that_stops_running_before_the_start_is_waited_for_again(rig: Rig) -> None:
     for name in ("arm", "camera_1", "camera_2", "hdr_merger", "fitter", "database_writer"):
         rig[name].state()

@@ -295,10 +295,42 @@ def test_the_interval_holds_between_the_runs_too(make_rig: MakeRig) -> None:
 
 
 def test_a_run_with_nothing_left_to_do_moves_nothing(rig: Rig) -> None:
-    rig.ready(scans=(1, 2), fitted=(1,), zero_ns=rig.stage.now_ns - MINUTE_NS)
+    rig.ready(scans=(1, 2), fitted=(1, 2), zero_ns=rig.stage.now_ns - MINUTE_NS)
     assert rig.exit == Exit(0)
     assert [(c.action, c.lamp) for c in rig.commands] == [("lamp", False)]
-    assert rig.stage.log("warning") == ["scans [2] of an earlier run are stored, not fitted"]
+
+
+@pytest.mark.parametrize("scans", [2, 3])
+def test_scans_that_were_not_fitted_are_waited_for(make_rig: MakeRig, scans: int) -> None:
+    """Whether or not there is something left to measure."""
+    rig = make_rig(scans=scans)
+    rig.ready(scans=(1, 2), fitted=(), zero_ns=rig.stage.now_ns - MINUTE_NS)
+    rig.play_until(lambda: rig.status.state == "finishing")
+    for scan in (1, 2):
+        assert rig.exit is None
+        rig.stored(scan, "parameters")
+    assert rig.exit == Exit(0)
+    assert {scan for scan, _, _ in rig.sweeps()} == set(range(3, scans + 1))
+    assert "scans [1, 2] are stored, not fitted; they are fitted now" in rig.stage.log("info")
+
+
+def test_scans_may_be_fitted_before_the_sequencer_begins(rig: Rig) -> None:
+    rig.database(scans=(1, 2), fitted=(1,), zero_ns=rig.stage.now_ns - MINUTE_NS)
+    rig.stored(2, "parameters")
+    rig.database(scans=(1, 2), fitted=(1, 2), zero_ns=rig.stage.now_ns - MINUTE_NS)
+    assert rig.exit is None
+    rig.all_running()
+    rig.play()
+    assert rig.exit == Exit(0)
+
+
+def test_an_earlier_scan_that_can_not_be_fitted_makes_the_run_fail_at_its_end(rig: Rig) -> None:
+    rig.ready(scans=(1,), fitted=(), zero_ns=rig.stage.now_ns - MINUTE_NS)
+    rig.stored(1, "parameters", refused="scan01.npz is no zip file")
+    end = rig.play_to_end()
+    text = "parameters of scan 1 can't be stored: scan01.npz is no zip file"
+    assert end == Exit(1, text)
+    assert {scan for scan, _, _ in rig.sweeps()} == {2}
 
 
 def test_a_restarted_writer_tells_its_state_again_without_harm(rig: Rig) -> None:

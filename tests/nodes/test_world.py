@@ -25,7 +25,7 @@ from tvbrdf_nodes.world.scene import (
 )
 
 if TYPE_CHECKING:
-    from conftest import MakeStage, Stage
+    from tests.nodes.stage import MakeStage, Stage
 
 STEP_NS = 100_000_000
 DEVICES = ("arm_controller", "second_controller")

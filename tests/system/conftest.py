@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 
+from tests.launcher_process import LauncherProcess
 from tvbrdf_fitting.published.database import StoredSample, read_database
 from tvbrdf_launch.process_table import ProcessTable, read_processes
 from tvbrdf_messages.bus.watcher import Watcher
 from tvbrdf_messages.run_directory import Graph, read_graph
 from tvbrdf_messages.schema import Message
 
-LIMIT_S = 60.0
-"""Any run here takes a few seconds: what takes longer hangs."""
 SMALL: dict[str, Any] = {
     "sweep_s": 4,  # 3 s would need more room to accelerate than the arm has
     "exposures_ms": "[0.2,4.0]",
@@ -35,23 +30,19 @@ SMALL: dict[str, Any] = {
     "interval_s": 60,
     "scans": 2,
 }
-T = TypeVar("T")
 
 
-class Rig:
-    """A launcher in a process of its own, with a short private directory for everything."""
+class Rig(LauncherProcess):
+    """A launcher of the simulated rig, with a short private directory for everything."""
+
+    limit_s = 60.0
+    """Any run here takes a few seconds."""
 
     def __init__(self) -> None:
         # the path of a Unix socket has at most 107 characters
-        self.folder = Path(tempfile.mkdtemp(prefix="tv"))
-        self.run, self.database = self.folder / "r", self.folder / "db"
-        self.output = self.folder / "output.txt"
-        self.environment = {
-            **{k: v for k, v in os.environ.items() if not k.startswith("TVBRDF_")},
-            "XDG_RUNTIME_DIR": str(self.folder),
-            "PYTHONUNBUFFERED": "1",
-        }
-        self.process: subprocess.Popen[bytes] | None = None
+        folder = Path(tempfile.mkdtemp(prefix="tv"))
+        super().__init__(folder, folder)
+        self.run, self.database = folder / "r", folder / "db"
 
     # -- starting and ending
 
@@ -60,57 +51,13 @@ class Rig:
         if file == "simulated_rig":
             arguments = {**SMALL, "database": self.database, **arguments}
         words = (*words, *(f"{key}:={value}" for key, value in arguments.items()))
-        command = [sys.executable, "-m", "tvbrdf_launch", "launch", str(file), "--plain"]
-        with self.output.open("wb") as output:
-            self.process = subprocess.Popen(
-                [*command, "--run", str(self.run), *words],
-                env=self.environment,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                cwd=self.folder,
-                start_new_session=True,
-            )
-
-    def tvbrdf(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """Run another verb to its end."""
-        return subprocess.run(
-            [sys.executable, "-m", "tvbrdf_launch", *words],
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=LIMIT_S,
-            cwd=self.folder,
-            check=False,
-        )
-
-    def wait(self, limit_s: float = LIMIT_S) -> int:
-        """Return the launcher's exit status."""
-        assert self.process is not None
-        try:
-            return self.process.wait(limit_s)
-        except subprocess.TimeoutExpired:
-            pytest.fail(f"the run did not end within {limit_s} s:\n{self.text()}")
-
-    def signal(self, number: signal.Signals) -> None:
-        """Send the launcher a signal."""
-        assert self.process is not None
-        self.process.send_signal(number)
+        self.start(str(file), "--plain", "--run", str(self.run), *words)
 
     def kill(self, node: str) -> None:
         """Kill a node's process."""
         assert self.table().nodes[node].send(signal.SIGKILL)
 
     # -- looking
-
-    def wait_for(self, find: Callable[[], T | None], what: str, limit_s: float = LIMIT_S) -> T:
-        """Return what ``find`` gives once it is true."""
-        deadline = time.monotonic() + limit_s
-        while not (found := find()):
-            if time.monotonic() > deadline:
-                pytest.fail(f"waited {limit_s} s in vain for {what}:\n{self.text()}")
-            time.sleep(0.005)  # nothing to block on
-        return found
 
     def graph(self) -> Graph:
         """Return the run's graph once it is written and its processes are started."""
@@ -133,10 +80,10 @@ class Rig:
         return Watcher(self.graph(), topics)
 
     def until(
-        self, watcher: Watcher, wanted: Callable[[Message], bool], limit_s: float = LIMIT_S
+        self, watcher: Watcher, wanted: Callable[[Message], bool], limit_s: float | None = None
     ) -> Message:
         """Return the first message that is wanted."""
-        deadline = time.monotonic() + limit_s
+        deadline = time.monotonic() + (limit_s or self.limit_s)
         while time.monotonic() < deadline:
             arrival = watcher.receive(0.2)
             if arrival is not None and wanted(arrival.envelope.message):
@@ -154,10 +101,6 @@ class Rig:
         """Return the run's processes."""
         return read_processes(self.run)
 
-    def text(self) -> str:
-        """Return what the launcher printed."""
-        return self.output.read_text() if self.output.exists() else ""
-
     def controller(self) -> dict[str, Any]:
         """Return what the simulated arm controller, the hardware, left."""
         found: dict[str, Any] = json.loads((self.run / "arm_controller.json").read_text())
@@ -168,23 +111,11 @@ class Rig:
         (sample,) = read_database(self.database).samples
         return sample
 
-    def processes(self) -> list[int]:
-        """Return every process with this run's environment, grandchildren too."""
-        mark = f"XDG_RUNTIME_DIR={self.folder}".encode()
-        found = []
-        for path in Path("/proc").glob("[0-9]*"):
-            with contextlib.suppress(OSError):
-                variables = (path / "environ").read_bytes().split(b"\0")
-                state = (path / "stat").read_text().rpartition(")")[2].split()[0]
-                if mark in variables and state not in "ZX":
-                    found.append(int(path.name))
-        return found
-
     # -- what must always hold
 
     def expect_nothing_left(self, limit_s: float = 10.0) -> None:
         """No process, no socket; the arm stands still and its lamp is off."""
-        self.wait_for(lambda: not self.processes(), f"the end of {self.processes()}", limit_s)
+        self.expect_no_process(limit_s)
         left = [path.name for path in self.run.iterdir() if path.is_socket()]
         assert left == [], f"socket files are left: {left}"
         self.expect_safe()
@@ -217,16 +148,5 @@ class Rig:
 @pytest.fixture
 def rig() -> Iterator[Rig]:
     one = Rig()
-    left: list[int] = []
-    try:
+    with one.cleared():
         yield one
-        if one.process is None or one.process.poll() is not None:
-            left = one.processes()
-    finally:
-        for pid in one.processes():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        if one.process is not None:
-            one.process.wait()
-        shutil.rmtree(one.folder, ignore_errors=True)
-    assert not left, f"processes {left} outlived their launcher"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from conftest import Rig
+    from tests.system.conftest import Rig
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 

@@ -17,7 +17,7 @@ import zmq
 from tvbrdf_messages.messages import Diagnostics
 
 if TYPE_CHECKING:
-    from conftest import Rig
+    from tests.system.conftest import Rig
 
 pytestmark = pytest.mark.system
 

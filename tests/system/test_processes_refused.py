@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from conftest import Rig
+    from tests.system.conftest import Rig
 
 pytestmark = pytest.mark.system
 
@@ -90,7 +90,7 @@ def test_a_folder_of_somebody_else_is_not_written_to(rig: Rig) -> None:
     assert "Traceback" not in rig.text()
     assert [path.name for path in rig.database.iterdir()] == ["thesis.tex"]
     assert thesis.read_text() == "precious"
-    rig.wait_for(lambda: not rig.processes(), "the end of all processes", 5.0)
+    rig.expect_no_process(5.0)
 
 
 def test_a_database_is_not_gone_on_with_unasked(rig: Rig) -> None:

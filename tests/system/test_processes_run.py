@@ -13,7 +13,7 @@ import pytest
 from tvbrdf_fitting.published import read_sample
 
 if TYPE_CHECKING:
-    from conftest import Rig
+    from tests.system.conftest import Rig
 
 pytestmark = pytest.mark.system
 
@@ -68,7 +68,7 @@ def test_the_launcher_is_killed_in_mid_sweep(rig: Rig) -> None:
     rig.signal(signal.SIGKILL)
     rig.wait()
     # nodes end on the pipe's end; one that hangs ends itself after 5 s
-    rig.wait_for(lambda: not rig.processes(), "the end of all processes", 8.0)
+    rig.expect_no_process(8.0)
     rig.expect_safe()
 
 

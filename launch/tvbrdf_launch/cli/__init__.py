@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from . import (
     arm,
+    bag,
     bench,
     demo,
     design,
@@ -19,6 +20,7 @@ from . import (
     model,
     node,
     preview,
+    refit,
     report,
     samples,
     scan,
@@ -37,7 +39,9 @@ VERBS = (
     preview,
     mark,
     report,
+    bag,
     fit,
+    refit,
     samples,
     model,
     design,
@@ -97,11 +101,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _explain(error: Exception) -> str | None:
     """Return an expected error in one line; None for one that is a fault of this program."""
+    from tvbrdf_messages.bag.errors import BagError
     from tvbrdf_messages.errors import BusError
 
     from ..errors import LaunchError, RunError
 
-    if isinstance(error, (LaunchError, RunError, BusError)):
+    if isinstance(error, (LaunchError, RunError, BusError, BagError)):
         return str(error)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from ._common import Subparsers, add_json_option, add_verb, print_json, print_table
 
 if TYPE_CHECKING:
+    from tvbrdf_messages.run_directory import Graph
+
     from ..display import Display
 
 
@@ -118,9 +122,11 @@ def launch(
         names = [node.name for node in plan.nodes]
         settings = dict(described.arguments)
         if as_json:
-            print_json({"file": str(described.path), "arguments": settings, "nodes": names})
+            found = {"file": str(described.path), "arguments": settings, "nodes": names}
+            print_json({**found, "notices": list(plan.notices)} if plan.notices else found)
         else:
             print(f"{described.path}: good; {len(names)} nodes: {', '.join(names)}")
+            _print_lines(plan.notices)
         return 0
     from ..launcher import Launcher
     from ..truth import write_truth
@@ -134,7 +140,26 @@ def launch(
 
         return TerminalDisplay(plan.graph.simulated)
 
+    _print_lines(plan.notices)
     status = Launcher(plan, RunFolder(directory), make_display).run()
     if plan.graph.simulated:
         write_truth(plan.graph)
+    _print_recorded(plan.graph)
     return status
+
+
+def _print_recorded(graph: Graph) -> None:
+    """Print what was recorded, if anything was."""
+    from tvbrdf_nodes.core.loading import NODES
+
+    if any(p.node == NODES["recorder"] for p in graph.participants):
+        from tvbrdf_nodes.recorder.record_book import describe_bags
+
+        _print_lines(describe_bags(graph))
+
+
+def _print_lines(lines: Iterable[str]) -> None:
+    """Print lines at once; that nobody looks any more ends nothing."""
+    with contextlib.suppress(BrokenPipeError):
+        for line in lines:
+            print(line, flush=True)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
+from collections.abc import Sequence
 from typing import Any
 
+from ..codec import decode
 from ..envelope import Envelope, Header, boot_id, host_name, new_incarnation
 from ..errors import MessageError
 from ..run_directory import Graph
@@ -53,8 +55,9 @@ class InProcessPort:
         self._latched: dict[str, Envelope] = {}
         self._kept: dict[str, dict[str, Envelope]] = defaultdict(dict)
         self._known: dict[str, str] = {}
+        self._counted = frozenset(p.name for p in bus.graph.participants if p.counted_bytes)
         self._counters = dict.fromkeys(
-            ("sent", "undelivered", "received", "gaps", "repeats", "refused"), 0
+            ("sent", "undelivered", "left_out", "received", "gaps", "repeats", "refused"), 0
         )
 
     def note(self, event: PortEvent) -> None:
@@ -115,14 +118,27 @@ class InProcessPort:
             hardware_ns,
         )
         envelope = Envelope(topic, header, message)
-        if row.latched:
-            self._latched[topic] = envelope
         if keep:
             self._kept[topic][keep] = envelope
+        return self._send_to_all(envelope)
+
+    def forward(self, parts: Sequence[Any]) -> bool:
+        """See :meth:`.port.Port.forward`."""
+        envelope = decode(parts)
+        if envelope.topic not in self._gives:
+            raise MessageError(f"{self.name} does not give {envelope.topic}")
+        return self._send_to_all(envelope)
+
+    def _send_to_all(self, envelope: Envelope) -> bool:
+        topic = envelope.topic
+        if find_topic(topic).latched:
+            self._latched[topic] = envelope
         delivered = True
         for reader in self._bus.graph.readers(self.name, topic):
             if reader in self._bus.ports:
                 self._bus.ports[reader].take(envelope)
+            elif reader in self._counted:
+                self._counters["left_out"] += 1
             else:
                 delivered = False
                 self._counters["undelivered"] += 1
@@ -156,7 +172,7 @@ class InProcessPort:
             f"{reader}:{topic}"
             for topic in sorted(self._gives)
             for reader in self._bus.graph.readers(self.name, topic)
-            if reader not in self._bus.ports
+            if reader not in self._bus.ports and reader not in self._counted
         )
 
     def counters(self) -> dict[str, Any]:

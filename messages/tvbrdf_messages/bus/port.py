@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 from ..envelope import Envelope
@@ -44,6 +45,14 @@ class Port(Protocol):
         :meth:`release`. Small lossless messages may wait to travel together until the port is
         serviced, which its owner does before it waits for anything. Waits for credit on a lossless
         topic; a live source does not wait: then ``False`` says that a reader did not get it.
+        """
+        ...
+
+    def forward(self, parts: Sequence[Any]) -> bool:
+        """Send a recorded message as it is, header and all, to every reader that the graph names.
+
+        ``parts`` are those of a multipart message, its topic one that this port gives. Waits as
+        :meth:`publish` does.
         """
         ...
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from .zmq_subscriber import DEFAULT_CREDIT_BYTES, ZmqSubscriber
 
 WAIT_MS = 100
 """How often a wait for credit looks whether it should end."""
+COUNTED_START_S = 5.0
+"""How long a start waits for counted readers, and theirs for publishers: after that without."""
 
 
 class ZmqPort:
@@ -48,11 +51,16 @@ class ZmqPort:
         self.incarnation = new_incarnation()
         self._stopping = stopping
         self._ready: Ready = None
+        self._opened_s = time.monotonic()
+        counted_bytes = graph.find(name).counted_bytes
+        self._counted = counted_bytes > 0
         for channel in ("lossless", "latest"):
             # a socket file outlives a killed process; the launcher starts one process a name
             Path(graph.endpoint(name, channel).removeprefix("ipc://")).unlink(missing_ok=True)
         self.publisher = ZmqPublisher(graph, name, self.incarnation, context, self._wait_for_credit)
-        self.subscriber = ZmqSubscriber(graph, name, self.incarnation, context, credit_bytes)
+        self.subscriber = ZmqSubscriber(
+            graph, name, self.incarnation, context, counted_bytes or credit_bytes
+        )
         self._waiter = zmq.Poller()
         self._waiter.register(self.publisher.router, zmq.POLLIN)
         for link in self.subscriber.links:
@@ -74,6 +82,10 @@ class ZmqPort:
     ) -> bool:
         """See :meth:`.port.Port.publish`."""
         return self.publisher.publish(topic, message, (stamp_ns, received_ns, hardware_ns), keep)
+
+    def forward(self, parts: Sequence[Any]) -> bool:
+        """See :meth:`.port.Port.forward`."""
+        return self.publisher.forward(list(parts))
 
     def release(self, topic: str, key: str) -> None:
         """See :meth:`.port.Port.release`."""
@@ -109,8 +121,16 @@ class ZmqPort:
         return found
 
     def ready(self) -> bool:
-        """Return whether all readers have registered here, and this one everywhere."""
-        return self.subscriber.registered() and not self.publisher.missing_readers()
+        """Return whether all readers have registered here, and this one everywhere.
+
+        What is counted is waited for a little while only.
+        """
+        registered = self.subscriber.registered()
+        if self.publisher.missing_readers() or not (registered or self._counted):
+            return False
+        if registered and not self.publisher.lacks_counted():
+            return True
+        return time.monotonic() - self._opened_s > COUNTED_START_S
 
     def missing_readers(self) -> tuple[str, ...]:
         """See :meth:`.port.Port.missing_readers`."""
@@ -123,6 +143,7 @@ class ZmqPort:
             "sent": publisher.sent,
             "sent_bytes": publisher.sent_bytes,
             "undelivered": publisher.undelivered,
+            "left_out": publisher.left_out,
             "received": subscriber.received,
             "received_bytes": subscriber.received_bytes,
             "gaps": subscriber.gaps,

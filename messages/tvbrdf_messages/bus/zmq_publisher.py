@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from collections.abc import Callable, Container
 from typing import Any
@@ -23,6 +24,9 @@ TOGETHER_BYTES = 16384
 """Small lossless messages wait for each other up to this size, or until :meth:`flush`."""
 COMMAND_CREDIT_BYTES = 8 << 20
 MESSAGE_OVERHEAD_BYTES = 64
+COUNTED_WAIT_S = 1.0
+"""What a simulated source waits for a counted reader that has stopped reading; it costs the run no
+time of its own. Nobody else waits for one at all."""
 # plain integers: arithmetic with pyzmq's enumerations takes longer than sending does
 DONTWAIT, SNDMORE, POLLIN = int(zmq.DONTWAIT), int(zmq.SNDMORE), int(zmq.POLLIN)
 _BROKEN = (
@@ -58,6 +62,7 @@ class _Reader:
         "incarnation",
         "lossless",
         "name",
+        "stalled",
         "topics",
         "waiting",
         "waiting_bytes",
@@ -69,6 +74,7 @@ class _Reader:
     ) -> None:
         self.name, self.identity, self.incarnation = name, identity, incarnation
         self.topics = topics
+        self.stalled = False  # a counted reader that was waited for in vain
         self.lossless = credit
         self.command = COMMAND_CREDIT_BYTES
         self.waiting: list[bytes] = []  # small messages of one topic, to be sent together
@@ -95,7 +101,9 @@ class ZmqPublisher:
             for topic, row in self._topics.items()
             if row.quality != LATEST
         }
+        self._counted = frozenset(p.name for p in graph.participants if p.counted_bytes)
         self._live = me.live
+        self._patient = graph.simulated and not me.live
         self._wait_for_credit = wait_for_credit
         self._sequence: defaultdict[str, int] = defaultdict(int)
         self._who = (name, incarnation, host_name(), boot_id())
@@ -105,6 +113,8 @@ class ZmqPublisher:
         self._watched: set[str] = set()
         self.events: list[PortEvent] = []
         self.sent, self.sent_bytes, self.undelivered, self.refused = 0, 0, 0, 0
+        self.left_out = 0
+        """Messages that a counted reader had no room for, or was not there for."""
 
         self.router = context.socket(zmq.ROUTER)
         self.router.linger = 1000
@@ -131,10 +141,22 @@ class ZmqPublisher:
         header = Header(*self._who, sequence, *stamps)
         parts = encode(topic, header, message)
         self._sequence[name] = sequence + 1
-        if topic.latched:
-            self._latched[name] = parts
         if keep:
             self._kept[name][keep] = parts
+        return self._send_to_all(topic, parts)
+
+    def forward(self, parts: list[Any]) -> bool:
+        """Send a recorded message to all readers and watchers; False when a reader lacks it."""
+        name = bytes(parts[0]).decode(errors="replace")
+        topic = self._topics.get(name)
+        if topic is None:
+            raise MessageError(f"{self._name} does not give {name}")
+        return self._send_to_all(topic, parts)
+
+    def _send_to_all(self, topic: Topic, parts: list[Any]) -> bool:
+        name = topic.name
+        if topic.latched:
+            self._latched[name] = parts
         size = size_bytes(parts) + MESSAGE_OVERHEAD_BYTES
         delivered = True
         for reader in self._wanted.get(name, ()):
@@ -154,16 +176,24 @@ class ZmqPublisher:
         return self._sequence[topic]
 
     def missing_readers(self) -> tuple[str, ...]:
-        """Return ``reader:topic`` for each reader that has not registered."""
+        """Return ``reader:topic`` for each reader that has not registered, but no counted ones."""
         return tuple(
             f"{reader}:{topic}"
             for topic, readers in sorted(self._wanted.items())
-            for reader in sorted(readers)
+            for reader in sorted(readers - self._counted)
             if reader not in self._readers or topic not in self._readers[reader].topics
         )
 
+    def lacks_counted(self) -> bool:
+        """Return whether a counted reader has not registered."""
+        wanted = frozenset().union(*self._wanted.values()) & self._counted
+        return not wanted <= self._readers.keys()
+
     def _deliver(self, name: str, topic: Topic, parts: list[Any], size: int) -> bool:
         lossless = topic.quality == LOSSLESS
+        if name in self._counted:
+            self.left_out += not self._offer(name, topic, parts, size)
+            return True
         while True:
             reader = self._readers.get(name)
             if reader is not None and topic.name in reader.topics:
@@ -188,6 +218,36 @@ class ZmqPublisher:
             if self._live or not self._wait_for_credit():
                 self.undelivered += 1
                 return False
+
+    def _offer(self, name: str, topic: Topic, parts: list[Any], size: int) -> bool:
+        """Send to a counted reader if it is there and has room; say whether it was."""
+        lossless = topic.quality == LOSSLESS
+        if lossless and self._patient:
+            self._wait_for_counted(name)
+        reader = self._readers.get(name)
+        if reader is None or (reader.lossless if lossless else reader.command) <= 0:
+            return False
+        together = lossless and len(parts) == 2
+        if not (self._join(reader, parts) if together else self._post(reader, parts)):
+            return False
+        if lossless:
+            reader.lossless -= size
+        else:
+            reader.command -= size
+        return True
+
+    def _wait_for_counted(self, name: str) -> None:
+        """Wait a moment for room at a counted reader, once until it reads again."""
+        deadline = 0.0
+        while True:
+            reader = self._readers.get(name)
+            if reader is None or reader.stalled or reader.lossless > 0:
+                return
+            now = time.monotonic()
+            deadline = deadline or now + COUNTED_WAIT_S
+            if now >= deadline or not self._wait_for_credit():
+                reader.stalled = True
+                return
 
     def _join(self, reader: _Reader, parts: list[Any]) -> bool:
         """Put a small message beside those that wait, and send them when they are enough."""
@@ -274,6 +334,7 @@ class ZmqPublisher:
             lossless, command = msgpack.unpackb(body)
             for reader in self._readers.values():
                 if reader.identity == identity:
+                    reader.stalled = False
                     reader.lossless += int(lossless)
                     reader.command += int(command)
         elif kind == HELLO:

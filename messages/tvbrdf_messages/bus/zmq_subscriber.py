@@ -42,7 +42,8 @@ class _Link:
         self.publisher, self.topics, self.socket = publisher, topics, socket
         self.monitor = socket.get_monitor_socket(zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED)
         self.incarnation = ""
-        self.expected: dict[str, int] = {}
+        self.expected: dict[tuple[str, str, str], int] = {}
+        """Next sequence number by topic, publisher and its life: a player forwards others'."""
         self.credit_bytes = credit_bytes
         self.taken = [0, 0]  # bytes handed out since credit was last given: lossless, command
         self.handled = [0, 0]
@@ -75,6 +76,7 @@ class ZmqSubscriber:
         self.received, self.received_bytes = 0, 0
         self.gaps, self.repeats, self.refused = 0, 0, 0
         self._early: list[Envelope] = []
+        self._turn = 0
         self.links: list[_Link] = []
         by_publisher: dict[str, list[str]] = {}
         latest: list[tuple[str, str]] = []
@@ -135,7 +137,9 @@ class ZmqSubscriber:
     def receive(self, limit: int, ready: Ready = None) -> list[Envelope]:
         """Return up to about ``limit`` messages; those of the call before count as handled."""
         found, self._early = self._early, []
-        for link in self.links:
+        # from another publisher on each time: where all have much to say, none is left behind
+        self._turn = (self._turn + 1) % max(len(self.links), 1)
+        for link in (*self.links[self._turn :], *self.links[: self._turn]):
             link.handled[0] += link.taken[0]
             link.handled[1] += link.taken[1]
             link.taken = [0, 0]
@@ -147,6 +151,8 @@ class ZmqSubscriber:
             link.give_credit()
         latest = self.latest
         if latest is not None and (ready is None or latest in ready):
+            # beyond the limit: behind a long queue the clock would stand still
+            limit += len(found)
             while len(found) < limit and readable(latest):
                 self._decode(_receive_parts(latest), found)
         return found
@@ -178,14 +184,15 @@ class ZmqSubscriber:
             self.events.append(PortEvent("refused", "unknown", text=f"{error!s:.200}"))
 
     def _count_gap(self, link: _Link, envelope: Envelope) -> None:
-        sequence = envelope.header.sequence
-        expected = link.expected.get(envelope.topic)
+        header = envelope.header
+        key = (envelope.topic, header.publisher, header.incarnation)
+        sequence, expected = header.sequence, link.expected.get(key)
         if expected is not None and sequence != expected:
             if sequence < expected:
                 self.repeats += 1
                 return
             self.gaps += sequence - expected
-        link.expected[envelope.topic] = sequence + 1
+        link.expected[key] = sequence + 1
 
     def _take_control(self, link: _Link, parts: list[Any]) -> None:
         if parts[0] == WELCOME and len(parts) == 2:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import ArmState, ScanCommand
 
-from ..core.commands import CommandGate
-from ..core.device import DeviceError, DriverContext
-from ..core.loading import load_class
+from ..core.commands import CommandGate, result_of
+from ..core.device import DeviceError, make_driver
 from ..core.node import Node, NodeContext, Output, Outputs, Send, TopicUse
-from ..core.parameters import build
 from .driver import (
     Acknowledged,
     ArmDriver,
@@ -26,37 +24,14 @@ from .driver import (
     Refused,
     RoundTrip,
 )
+from .parameters import ArmParameters
 from .rules import NOT_OURS, refuse_command, time_limit_s
-from .tasks import ANSWER, MOTION, Task, result
+from .tasks import ANSWER, MOTION, Task
 
 SERVICE_S = 0.05
 STOP_LIMIT_S = 60.0
 """On the run's clock: within that the arm must be at rest after a stop."""
 ROUND_TRIPS = 200
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ArmParameters:
-    """Which arm, and how its node deals with it."""
-
-    driver: str = "tvbrdf_nodes.arm.serial_arm:SerialArm"
-    driver_parameters: dict[str, Any] = field(default_factory=dict)
-    idle_tick_rate_hz: float = 2.0
-    """How often the controller's clock is asked for (run's clock)."""
-    sweep_tick_rate_hz: float = 10.0
-    home_limit_s: float = 120.0
-    """On the run's clock; other motions have limits that follow from their speed."""
-    stop_limit_s: float = 1.0
-    """Real time to wait at the end until the controller acknowledges stop and lamp off."""
-    commander_lost_s: float = 5.0
-    """Real time without a sequencer after which the arm stops and the lamp goes off."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that make no sense."""
-        names = ("idle_tick_rate_hz", "sweep_tick_rate_hz", "home_limit_s", "stop_limit_s")
-        for name in (*names, "commander_lost_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0")
 
 
 class ArmNode(Node[ArmParameters]):
@@ -71,16 +46,9 @@ class ArmNode(Node[ArmParameters]):
 
     def __init__(self, context: NodeContext, parameters: ArmParameters) -> None:
         super().__init__(context, parameters)
-        driver_class = load_class(parameters.driver)
-        driver_context = DriverContext(
-            name=context.name,
-            clock=context.clock,
-            log=context.log,
-            run_directory=context.run_directory,
-            open_link=lambda: context.open_link(f"{context.name}.device"),
+        self._driver: ArmDriver = make_driver(
+            context, parameters.driver, parameters.driver_parameters
         )
-        driver_parameters = build(driver_class.parameters_type, parameters.driver_parameters)
-        self._driver: ArmDriver = driver_class(driver_parameters, driver_context)
         self._gate = CommandGate("all", "arm", context.name)
         self._ready = self._open = False
         self._state: ArmReading | None = None
@@ -381,8 +349,15 @@ class ArmNode(Node[ArmParameters]):
     def _result(
         self, command: ScanCommand, state: str, reason: str, first_sequence: int = -1
     ) -> Send:
-        last = self.context.next_sequence("/arm/state") - 1 if first_sequence >= 0 else -1
-        message = result(self.context.name, command, state, reason, (first_sequence, last))
+        states = {}
+        if first_sequence >= 0:
+            last = self.context.next_sequence("/arm/state") - 1
+            states = {
+                "frames": last - first_sequence + 1,
+                "first_sequence": first_sequence,
+                "last_sequence": last,
+            }
+        message = result_of(command, self.context.name, state, reason, **states)
         return Send(topic="/scan/sweep_result", message=message)
 
     def _in(self, seconds: float) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import select
 import time
-from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
@@ -27,7 +26,6 @@ from .protocol import (
     Answer,
     Event,
     Line,
-    LineParser,
     ProtocolError,
     Refusal,
     Report,
@@ -36,10 +34,10 @@ from .serial_handshake import Handshake
 from .serial_line import SerialLine, byte_time_ns, is_path
 from .serial_motions import Ended, MotionTable
 from .serial_parameters import SerialArmParameters
+from .serial_quality import WatchedParser
 from .serial_requests import Pending, PendingRequests
 
 RETRY_OPEN_S = 0.1
-QUALITY_LINES = 50
 _MOTIONS = ("HOME", "MOVE", "SWEEP")
 
 
@@ -60,13 +58,12 @@ class SerialArm:
     def __init__(self, parameters: SerialArmParameters, context: DriverContext) -> None:
         self._parameters, self._context = parameters, context
         self._port: SerialLine | None = None
-        self._parser = LineParser()
+        self._parser = WatchedParser()
         self._requests = PendingRequests(
             self._write, context.clock, parameters.answer_timeout_s, parameters.attempts
         )
         self._handshake = Handshake(parameters, self._requests)
         self._ready = False
-        self._quality: deque[bool] = deque(maxlen=QUALITY_LINES)
         self._found: list[Reading] = []
         self._connect_limit_s, self._next_try_s = 0.0, 0.0
         self._next_alive_s = 0.0
@@ -217,11 +214,7 @@ class SerialArm:
 
     def _receive(self) -> None:
         for chunk in () if self._port is None else self._port.read():
-            bad = self._parser.unreadable
-            lines = self._parser.feed(chunk.data)
-            self._quality.extend([False] * len(lines))
-            self._quality.extend([True] * (self._parser.unreadable - bad))
-            for line in lines:
+            for line in self._parser.feed(chunk.data):
                 if self._parameters.arrival_stamps == "host":
                     self._take(line, chunk.received_ns)
                 elif line.stamps:
@@ -370,15 +363,9 @@ class SerialArm:
         return " and nothing came: is it switched on, and is this its port?"
 
     def _check_quality(self) -> None:
-        bad = sum(self._quality)
-        full = len(self._quality) == QUALITY_LINES
-        if full and bad > self._parameters.max_unreadable_fraction * QUALITY_LINES:
-            parser = self._parser
-            raise self._error(
-                f"{bad} of the last {QUALITY_LINES} lines were unreadable "
-                f"({parser.wrong_checksums} wrong checksums, {parser.malformed} malformed, "
-                f"{parser.too_long} too long in all); check baud_rate, cable and shielding"
-            )
+        trouble = self._parser.trouble(self._parameters.max_unreadable_fraction)
+        if trouble:
+            raise self._error(trouble)
 
     def _error(self, text: str) -> DeviceError:
         return DeviceError(f"{self._parameters.port}: {text}")
@@ -410,10 +397,7 @@ class SerialArm:
     def counters(self) -> dict[str, float]:
         """See :class:`.driver.ArmDriver`."""
         return {
-            "lines": self._parser.read,
-            "wrong_checksums": self._parser.wrong_checksums,
-            "malformed_lines": self._parser.malformed,
-            "too_long_lines": self._parser.too_long,
+            **self._parser.counters(),
             "unstamped_lines": self._unstamped,
             "answers_unasked": self._unasked,
             "requests_repeated": self._requests.repeated,

@@ -1,10 +1,10 @@
-"""Commands that the arm is carrying out, and what became of them."""
+"""Commands that the arm is carrying out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tvbrdf_messages.messages import ScanCommand, SweepResult
+from tvbrdf_messages.messages import ScanCommand
 
 MOTION, ANSWER = "motion", "answer"
 
@@ -23,28 +23,3 @@ class Task:
     def sweeps(self) -> bool:
         """Whether it is a sweep."""
         return any(command.action == "sweep" for command in self.commands)
-
-
-def result(
-    source: str,
-    command: ScanCommand,
-    state: str,
-    reason: str = "",
-    sequences: tuple[int, int] = (-1, -1),
-) -> SweepResult:
-    """Return what is said about a command; ``sequences``: of the first and last state sent."""
-    first, last = sequences
-    return SweepResult(
-        source=source,
-        command_id=command.command_id,
-        action=command.action,
-        state=state,
-        reason=reason,
-        sample=command.sample,
-        scan=command.scan,
-        sweep=command.sweep,
-        attempt=command.attempt,
-        frames=last - first + 1 if first >= 0 else 0,
-        first_sequence=first,
-        last_sequence=last,
-    )

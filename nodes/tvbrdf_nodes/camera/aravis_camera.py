@@ -80,7 +80,6 @@ class AravisCamera:
         self._stale_left = 0
         self._last_id = -1
         self._rounds = 0
-        self._bad_buffers = 0
 
     @property
     def identity(self) -> CameraIdentity:
@@ -244,8 +243,7 @@ class AravisCamera:
             return None
         try:
             if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
-                self._bad_buffers += 1  # its number will be missing
-                return None
+                return None  # its number will be missing
             now_ns, utc_ns = self._context.clock.now_ns(), time.time_ns()
             # Aravis stamps arrival with the wall clock: only its age is used
             age_ns = min(max(utc_ns - buffer.get_system_timestamp(), 0), 10_000_000_000)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from tvbrdf_messages.messages import ScanCommand, SweepResult
 
+from ..core.commands import result_of
 from .driver import CaptureTag
-from .reports import answer
 
 LIGHT, DARK, STILL = "light", "dark", "still"
 SETTLING = "settling"
@@ -96,11 +96,11 @@ class Capture:
 
     def result(self, source: str) -> SweepResult:
         """Return the answer to its command."""
-        return answer(
-            source,
+        return result_of(
             self.command,
+            source,
+            "broken" if self.reasons else "done",
             "; ".join(self.reasons[:MAX_REASONS]),
-            state="broken" if self.reasons else "done",
             frames=self.frames,
             first_sequence=self.first_sequence,
             last_sequence=self.last_sequence,

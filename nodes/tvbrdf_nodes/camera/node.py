@@ -9,22 +9,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import CameraInfo, ScanCommand
 from tvbrdf_messages.topics import frame_topic, info_topic
 
-from ..core.commands import CommandGate
-from ..core.device import DeviceError, DriverContext
-from ..core.loading import load_class
+from ..core.commands import CommandGate, result_of
+from ..core.device import DeviceError, make_driver
 from ..core.node import Node, NodeContext, Outputs, Send, TopicUse
-from ..core.parameters import ParameterError, build
 from .capture import DARK, LIGHT, SETTLING, STILL, Capture
 from .driver import FREE_RUN, TRIGGER, CameraDriver, CameraSettings, RawFrame, Region
+from .parameters import CameraParameters
 from .reports import (
-    answer,
     camera_info,
     differ,
     frame_message,
@@ -38,31 +35,6 @@ FIRST_EXPOSURE_MS = 4.0
 _SILENCE, _SETTLED = "silence", "settled"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraParameters:
-    """Which driver, and how the camera is used; what is special to a driver is in its own."""
-
-    driver: str
-    """``module:Class``."""
-    driver_parameters: dict[str, Any] = field(default_factory=dict)
-    frame_rate_hz: float = 30.0
-    region: tuple[int, ...] | None = None
-    """x, y, width, height in pixels; null: the whole sensor."""
-    approximate_timing: bool = False
-    """Whether scans may use a camera without exact exposure or without hardware stamps."""
-    drop_stale_ms: float = 0.0
-    """Frames that arrive within this time after a change of exposure are thrown away."""
-    silence_s: float = 2.0
-    """A capture without a frame for this long (and ten frames' time) is broken."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that make no sense."""
-        if self.region is not None and len(self.region) != 4:
-            raise ValueError(f"region is {list(self.region)}, expected [x, y, width, height]")
-        if self.frame_rate_hz <= 0 or self.drop_stale_ms < 0 or self.silence_s <= 0:
-            raise ValueError("frame_rate_hz, silence_s must be above 0, drop_stale_ms 0 or more")
-
-
 class CameraNode(Node[CameraParameters]):
     """Serves one camera through its driver."""
 
@@ -71,22 +43,8 @@ class CameraNode(Node[CameraParameters]):
     def __init__(self, context: NodeContext, parameters: CameraParameters) -> None:
         super().__init__(context, parameters)
         name = context.name
-        driver_class = load_class(parameters.driver)
-        try:
-            own = build(driver_class.parameters_type, parameters.driver_parameters)
-        except ParameterError as error:
-            raise ParameterError(
-                "driver_parameters", f"{name}: driver_parameters: {error}"
-            ) from None
-        self._driver: CameraDriver = driver_class(
-            own,
-            DriverContext(
-                name=name,
-                clock=context.clock,
-                log=context.log,
-                run_directory=context.run_directory,
-                open_link=lambda: context.open_link(f"{name}.device"),
-            ),
+        self._driver: CameraDriver = make_driver(
+            context, parameters.driver, parameters.driver_parameters
         )
         self._gate = CommandGate("all", "cameras", name)
         self._topic = frame_topic(name)
@@ -159,8 +117,8 @@ class CameraNode(Node[CameraParameters]):
             "prepare": self._prepare,
             "sweep": self._sweep,
             "end_sweep": self._end_sweep,
-            "dark": self._dark,
-            "still": self._still,
+            "dark": self._take,
+            "still": self._take,
             "stop": self._stop,
         }
         reason = self._gate.refusal(envelope, command, self.context.clock.now_ns())
@@ -232,13 +190,14 @@ class CameraNode(Node[CameraParameters]):
             capture.spoil("the camera gave no frame")
         yield from self._finish()
 
-    def _dark(self, command: ScanCommand) -> Outputs:
+    def _take(self, command: ScanCommand) -> Outputs:
+        """Take some frames at each exposure in turn; goes on in :meth:`poll`."""
         exposures = deque(command.exposures_ms or (command.exposure_ms,))
-        yield from self._take(Capture(command, DARK, exposures, wanted=max(command.frames, 1)))
-
-    def _still(self, command: ScanCommand) -> Outputs:
-        exposures = deque(command.exposures_ms or (command.exposure_ms,))
-        yield from self._take(Capture(command, STILL, exposures, wanted=1))
+        kind, wanted = (DARK, max(command.frames, 1)) if command.action == "dark" else (STILL, 1)
+        self._prepared_ms = None
+        self._reopen()
+        self._capture = Capture(command, kind, exposures, wanted=wanted)
+        yield from self._next_exposure(self._capture)
 
     def _stop(self, command: ScanCommand) -> Outputs:
         self._prepared_ms = None
@@ -246,13 +205,6 @@ class CameraNode(Node[CameraParameters]):
         yield self._answer(command)
 
     # -- captures
-
-    def _take(self, capture: Capture) -> Outputs:
-        """Take the frames at each exposure in turn; goes on in :meth:`poll`."""
-        self._prepared_ms = None
-        self._reopen()
-        self._capture = capture
-        yield from self._next_exposure(capture)
 
     def _next_exposure(self, capture: Capture) -> Outputs:
         self._driver.stop()
@@ -448,5 +400,5 @@ class CameraNode(Node[CameraParameters]):
 
     def _answer(self, command: ScanCommand, reason: str = "", state: str = "done") -> Send:
         exposure_ms = self._settings.exposure_ms if self._settings is not None else 0.0
-        result = answer(self.context.name, command, reason, state=state, exposure_ms=exposure_ms)
+        result = result_of(command, self.context.name, state, reason, exposure_ms=exposure_ms)
         return Send(topic="/scan/sweep_result", message=result)

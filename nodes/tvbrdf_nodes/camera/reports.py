@@ -1,42 +1,13 @@
-"""What a camera node says: what its camera is, what came of a command, and why it won't do."""
+"""What a camera node says: what its camera is, what it saw, and why it won't do."""
 
 from __future__ import annotations
 
-from tvbrdf_messages.messages import CameraInfo, Frame, ScanCommand, SweepResult
+from tvbrdf_messages.messages import CameraInfo, Frame, ScanCommand
 
 from .driver import CameraIdentity, CameraSettings, RawFrame, Region
 
 EXPOSURE_TOLERANCE = 0.01
 """Relative difference of an exposure as read back from the one that was asked for."""
-
-
-def answer(
-    source: str,
-    command: ScanCommand,
-    reason: str = "",
-    *,
-    state: str = "done",
-    frames: int = 0,
-    first_sequence: int = -1,
-    last_sequence: int = -1,
-    exposure_ms: float = 0.0,
-) -> SweepResult:
-    """Return what came of a command."""
-    return SweepResult(
-        source=source,
-        command_id=command.command_id,
-        action=command.action,
-        state=state,
-        reason=reason,
-        sample=command.sample,
-        scan=command.scan,
-        sweep=command.sweep,
-        attempt=command.attempt,
-        frames=frames,
-        first_sequence=first_sequence,
-        last_sequence=last_sequence,
-        exposure_ms=exposure_ms,
-    )
 
 
 def camera_info(name: str, identity: CameraIdentity, settings: CameraSettings) -> CameraInfo:

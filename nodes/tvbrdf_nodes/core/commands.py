@@ -1,9 +1,14 @@
-"""Which commands a device's node carries out: none that is late, repeated or of an earlier run."""
+"""Which commands a device's node carries out, and how it says what came of them.
+
+None is carried out that is late, repeated or of an earlier run.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 from tvbrdf_messages.envelope import Envelope
-from tvbrdf_messages.messages import ScanCommand
+from tvbrdf_messages.messages import ScanCommand, SweepResult
 
 
 class CommandGate:
@@ -60,3 +65,21 @@ class CommandGate:
             self._incarnation = theirs
         self._last_id = command.command_id
         return ""
+
+
+def result_of(
+    command: ScanCommand, source: str, state: str, reason: str = "", **measured: Any
+) -> SweepResult:
+    """Return what came of a command; ``measured``: further fields of the message."""
+    return SweepResult(
+        source=source,
+        command_id=command.command_id,
+        action=command.action,
+        state=state,
+        reason=reason,
+        sample=command.sample,
+        scan=command.scan,
+        sweep=command.sweep,
+        attempt=command.attempt,
+        **measured,
+    )

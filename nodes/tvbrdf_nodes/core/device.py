@@ -6,8 +6,11 @@ import contextlib
 import os
 import queue
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
+
+from .loading import load_class
+from .parameters import ParameterError, build
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -15,7 +18,7 @@ if TYPE_CHECKING:
     from tvbrdf_messages.bus import Port
     from tvbrdf_messages.clock import RunClock
 
-    from .node import Logger
+    from .node import Logger, NodeContext
 
 
 class DeviceError(RuntimeError):
@@ -32,6 +35,43 @@ class DriverContext(NamedTuple):
     run_directory: Path
     open_link: Callable[[], Port]
     """Opens the port ``<name>.device``, for simulated devices (see their ``link_topics``)."""
+
+
+def make_driver(context: NodeContext, path: str, parameters: Mapping[str, Any]) -> Any:
+    """Return a node's driver.
+
+    Parameters
+    ----------
+    context
+        The node's.
+    path
+        ``module:Class``.
+    parameters
+        The driver's own, as the launch file has them.
+
+    Raises
+    ------
+    LoadingError
+        If there is no such class.
+    ParameterError
+        If it won't have the parameters.
+    """
+    driver_class = load_class(path)
+    try:
+        own = build(driver_class.parameters_type, parameters)
+    except ParameterError as error:
+        text = f"{context.name}: driver_parameters: {error}"
+        raise ParameterError("driver_parameters", text) from None
+    return driver_class(
+        own,
+        DriverContext(
+            name=context.name,
+            clock=context.clock,
+            log=context.log,
+            run_directory=context.run_directory,
+            open_link=lambda: context.open_link(f"{context.name}.device"),
+        ),
+    )
 
 
 class Driver(Protocol):
@@ -71,7 +111,6 @@ class ReaderThread(Generic[Item]):
         self._queue: queue.Queue[Item | Exception] = queue.Queue(depth)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._stopping = threading.Event()
-        self.overflows = 0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -87,10 +126,8 @@ class ReaderThread(Generic[Item]):
                 item = error
             if item is None:
                 continue
-            try:
+            with contextlib.suppress(queue.Full):  # the gap shows in what follows
                 self._queue.put_nowait(item)
-            except queue.Full:
-                self.overflows += 1
             if not self._stopping.is_set():
                 os.eventfd_write(self._wake, 1)
             if isinstance(item, Exception):

@@ -53,6 +53,7 @@ class InProcessGraph:
             runner.set_state(READY)
             runner.node.prepare()
         for runner in self.runners.values():
+            runner.port.events()  # of the registrations: nobody was restarted
             runner.put(runner.node.start())
             runner.set_state(RUNNING)
         return self

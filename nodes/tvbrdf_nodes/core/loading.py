@@ -14,6 +14,8 @@ NODES = {
     "fitter": "tvbrdf_nodes.fitter.node:FitterNode",
     "database_writer": "tvbrdf_nodes.database_writer.node:DatabaseWriterNode",
     "sequencer": "tvbrdf_nodes.sequencer.node:SequencerNode",
+    "player": "tvbrdf_nodes.player.node:PlayerNode",
+    "recorder": "tvbrdf_nodes.recorder.node:RecorderNode",
 }
 """Short names of the nodes that ship with the project."""
 

@@ -8,7 +8,7 @@ node as a process over ZeroMQ (:mod:`.process`), another runs the same classes i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
@@ -40,6 +40,13 @@ class Send:
 
 
 @dataclass(frozen=True, slots=True)
+class Forward:
+    """Publish a recorded message as it is: the parts of a multipart message, header and all."""
+
+    parts: Sequence[bytes]
+
+
+@dataclass(frozen=True, slots=True)
 class Release:
     """Forget a message that was sent with ``keep``."""
 
@@ -57,6 +64,10 @@ class Reply:
     data: dict[str, Any] = field(default_factory=dict)
 
 
+GIVE_UP = 3
+"""Exit code of a node without which the run can't go on, and which it won't help to start again."""
+
+
 @dataclass(frozen=True, slots=True)
 class Exit:
     """End this node's process; ``code`` 0 says that its work is done."""
@@ -65,7 +76,7 @@ class Exit:
     text: str = ""
 
 
-Output = Send | Release | Reply | Exit
+Output = Send | Forward | Release | Reply | Exit
 Outputs = Iterable[Output]
 
 
@@ -74,6 +85,11 @@ class TopicUse(NamedTuple):
 
     takes: tuple[str, ...] = ()
     gives: tuple[str, ...] = ()
+    selects: Callable[[str], bool] | None = None
+    """Says which topics it takes besides, of those that other nodes of the run give."""
+    counted_bytes: int = 0
+    """Above 0: nobody waits for it. Each publisher has so many bytes on the way to it at most;
+    what does not fit is left out, and counted as a gap."""
 
 
 class Logger(Protocol):
@@ -149,6 +165,11 @@ class Node(Generic[P]):
         """Return what a node of that name takes and gives."""
         raise NotImplementedError
 
+    @classmethod
+    def notices(cls, name: str, parameters: P, graph: Graph) -> Iterable[str]:
+        """Return what people should know before the run starts; ``ValueError`` refuses it."""
+        return ()
+
     def prepare(self) -> None:
         """Do what takes long (imports, tables) while the arm homes; all readers are there."""
 
@@ -174,6 +195,13 @@ class Node(Generic[P]):
 
     def on_found(self, publisher: str) -> Outputs:
         """Take note that a publisher is back, as a new incarnation."""
+        return ()
+
+    def on_epoch(self, epoch: int) -> Outputs:
+        """Empty what was joined so far: a replay has jumped, and what follows is of its new epoch.
+
+        The first epoch of a replay is not told.
+        """
         return ()
 
     def on_request(self, request: OperatorRequest) -> Outputs:

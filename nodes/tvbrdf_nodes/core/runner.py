@@ -11,13 +11,14 @@ from typing import Any
 
 from tvbrdf_messages.bus import Port
 from tvbrdf_messages.clock import RunClock, ToldClock
+from tvbrdf_messages.envelope import epoch_of
 from tvbrdf_messages.errors import BusError
 from tvbrdf_messages.messages import Clock, Diagnostics, Log
 from tvbrdf_messages.run_directory import Graph
 from tvbrdf_messages.topics import LOSSLESS, find_topic
 
 from .loading import load_class
-from .node import Exit, Logger, Node, Outputs, Release, Reply, Send
+from .node import Exit, Forward, Logger, Node, Outputs, Release, Reply, Send
 from .parameters import ParameterError, build
 
 WAITING, READY, RUNNING, FAULT, STOPPING = "waiting", "ready", "running", "fault", "stopping"
@@ -87,6 +88,8 @@ class NodeRunner:
         self.state, self.state_text = WAITING, ""
         self.exit: Exit | None = None
         self.replies: list[Reply] = []
+        self._epoch = 0
+        """Of the last message that a player sent after a jump."""
         self._timers: dict[str, int] = {}
         self._watchdogs: dict[str, float] = {}
         node_class: type[Node[Any]] = load_class(me.node)
@@ -160,14 +163,23 @@ class NodeRunner:
                 if isinstance(self.clock, ToldClock):
                     self.clock.tell(envelope.message.now_ns, envelope.message.epoch)
                 continue
+            self._note_epoch(epoch_of(envelope.header.incarnation))
             self.put(self.node.handle(envelope))
         return bool(found or events)
+
+    def _note_epoch(self, epoch: int) -> None:
+        """Tell the node of a replay's jump before the first message that was sent after it."""
+        if epoch > self._epoch:
+            self._epoch = epoch
+            self.put(self.node.on_epoch(epoch))
 
     def put(self, outputs: Outputs) -> None:
         """Carry out what a handler returned."""
         for output in outputs:
             if isinstance(output, Send):
                 self._publish(output)
+            elif isinstance(output, Forward):
+                self.port.forward(output.parts)
             elif isinstance(output, Release):
                 self.port.release(output.topic, output.key)
             elif isinstance(output, Reply):

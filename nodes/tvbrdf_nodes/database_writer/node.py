@@ -19,9 +19,6 @@ from ..core.device import DeviceError
 from ..core.node import Node, NodeContext, Outputs, Send, TopicUse
 
 if TYPE_CHECKING:
-    from tvbrdf_fitting.published.scan import CameraScan
-
-    from .records import FitRecord, ScanRecord
     from .store import DatabaseStore, Outcome
 
 RETRY_S = 5.0
@@ -41,7 +38,10 @@ class DatabaseWriterParameters:
 
 
 class DatabaseWriterNode(Node[DatabaseWriterParameters]):
-    """Stores scans, parameters, missing scans and notes; acknowledges each."""
+    """Stores scans, parameters, missing scans and notes; acknowledges each.
+
+    What is stored and not fitted it sends to the fitter: nobody else may have it any more.
+    """
 
     parameters_type = DatabaseWriterParameters
     drains = True
@@ -66,7 +66,7 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
                 "/scan/missing",
                 "/operator/mark",
             ),
-            gives=("/scan/stored", "/scan/database", "/diagnostics", "/log"),
+            gives=("/scan/stored", "/scan/database", "/scan/radiance", "/diagnostics", "/log"),
         )
 
     def prepare(self) -> None:
@@ -87,19 +87,35 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
             raise DeviceError(str(error)) from error
 
     def start(self) -> Outputs:
-        """Tell what the database holds."""
-        store = self._opened()
-        yield Send(
-            topic="/scan/database",
-            message=DatabaseState(
-                sample=self.parameters.sample,
-                scans=store.stored_scans(),
-                fitted=store.fitted_scans(),
-                missing=tuple(store.missing_scans()),
-                zero_ns=store.zero_ns(),
-                last_ns=store.last_ns(),
-            ),
-        )
+        """Tell what the database holds, and have fitted what is not."""
+        yield self._state()
+        yield from self._send_unfitted()
+
+    def on_reader(self, reader: str) -> Outputs:
+        """Send it again: a restarted fitter may lack it, a restarted sequencer waits for it."""
+        if {"/scan/radiance", "/scan/database"} & {*self.context.graph.find(reader).takes}:
+            yield from self._send_unfitted()
+
+    def _state(self) -> Send:
+        contents = self._opened().contents()
+        state = contents._asdict() | {"missing": tuple(contents.missing)}
+        message = DatabaseState(sample=self.parameters.sample, **state)
+        return Send(topic="/scan/database", message=message)
+
+    def _send_unfitted(self) -> Outputs:
+        from tvbrdf_fitting.published.database import DatabaseError
+
+        from .conversion import stored_radiance
+
+        for scan in self._opened().unfitted():
+            try:
+                message = stored_radiance(self.parameters.sample, scan)
+            except DatabaseError as error:
+                self.context.log.error(str(error))
+                yield self._stored_message(scan.scan, "parameters", refused=str(error))
+            else:
+                stamp_ns = int(message.stamp_ns.max(initial=scan.start_stamp_ns))
+                yield Send(topic="/scan/radiance", message=message, stamp_ns=stamp_ns)
 
     def handle(self, envelope: Envelope) -> Outputs:
         """Store a message; what has to wait is tried again later."""
@@ -115,6 +131,7 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
         from tvbrdf_fitting.published.database import DatabaseError, DiskFullError
 
         waiting, self._waiting = self._waiting, []
+        before = self._stored
         for envelope in sorted(waiting, key=lambda e: not isinstance(e.message, Radiance)):
             if self._must_wait(envelope):
                 self._waiting.append(envelope)
@@ -133,13 +150,15 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
                 refused = str(error)
                 self.context.log.error(refused)
             yield self._acknowledge(envelope, already=already, refused=refused)
+        if self._stored > before:
+            yield self._state()
 
     def _must_wait(self, envelope: Envelope) -> bool:
         """Return whether these are parameters of a scan that may still come."""
         message = envelope.message
         if not isinstance(message, Parameters) or message.scan in self._refused:
             return False
-        return message.scan not in self._opened().stored_scans()
+        return message.scan not in self._opened().contents().scans
 
     def _acknowledge(self, envelope: Envelope, *, already: bool, refused: str) -> Send:
         what = _KINDS[type(envelope.message)]
@@ -148,12 +167,15 @@ class DatabaseWriterNode(Node[DatabaseWriterParameters]):
             self._refused.add(scan)
         self._stored += not (already or refused)
         self._repeats += already
-        message = Stored(
-            sample=self.parameters.sample, scan=scan, what=what, already=already, refused=refused
-        )
+        return self._stored_message(scan, what, already=already, refused=refused)
+
+    def _stored_message(self, scan: int, what: str, **more: Any) -> Send:
+        message = Stored(sample=self.parameters.sample, scan=scan, what=what, **more)
         return Send(topic="/scan/stored", message=message)
 
     def _put(self, envelope: Envelope) -> Outcome:
+        from .conversion import fit_record, scan_record
+
         store, message = self._opened(), envelope.message
         if isinstance(message, Radiance):
             return store.store_scan(scan_record(message))
@@ -195,88 +217,3 @@ def _is_its_own_fault(error: Exception) -> bool:
     from sqlalchemy.exc import SQLAlchemyError
 
     return not isinstance(error.__cause__, (OSError, SQLAlchemyError))
-
-
-def scan_record(radiance: Radiance) -> ScanRecord:
-    """Return what the store keeps of a message."""
-    from .records import ScanRecord
-
-    names = (
-        "camera",
-        "sweep",
-        "exposure_ms",
-        "stamp_ns",
-        "light_angle_deg",
-        "light_direction",
-        "view_direction",
-        "radiance",
-        "variance",
-        "valid",
-        "light_angle_std_deg",
-        "grid_angle_deg",
-        "grid_radiance",
-        "grid_variance",
-        "grid_valid",
-    )
-    return ScanRecord(
-        sample=radiance.sample,
-        scan=radiance.scan,
-        start_stamp_ns=radiance.scan_start_ns,
-        time_s=radiance.scan_time_s,
-        exposures_ms=radiance.exposures_ms,
-        grid=_grid(radiance),
-        observations={name: getattr(radiance, name) for name in names},
-        quality={
-            **radiance.quality,
-            "gain_relative_std": radiance.gain_relative_std,
-            "frame_relative_std": list(radiance.frame_relative_std),
-        },
-    )
-
-
-def _grid(radiance: Radiance) -> dict[int, CameraScan]:
-    """Return each camera's radiance on the grid, without what is not valid."""
-    from tvbrdf_fitting.geometry import light_direction
-    from tvbrdf_fitting.published.scan import CameraScan
-
-    grid: dict[int, CameraScan] = {}
-    for index in range(radiance.grid_radiance.shape[0]):
-        seen = radiance.camera == index + 1
-        if not seen.any():
-            continue
-        valid = radiance.grid_valid[index].all(axis=1)
-        grid[index + 1] = CameraScan(
-            exposures_ms=radiance.exposures_ms,
-            light_direction=light_direction(radiance.grid_angle_deg[valid]),
-            view_direction=radiance.view_direction[seen][0],
-            radiance=radiance.grid_radiance[index][valid],
-        )
-    return grid
-
-
-def fit_record(parameters: Parameters) -> FitRecord:
-    """Return what the store keeps of a message."""
-    from .records import FitRecord
-
-    return FitRecord(
-        sample=parameters.sample,
-        scan=parameters.scan,
-        model=parameters.model,
-        parameter_names=parameters.parameter_names,
-        values=parameters.values,
-        standard_deviations=parameters.standard_deviations,
-        covariance=parameters.covariance,
-        errors={
-            **parameters.errors,
-            "chi_square": parameters.chi_square,
-            "degrees_of_freedom": parameters.degrees_of_freedom,
-            "model_error_std": parameters.model_error_std,
-        },
-        solver=parameters.solver,
-        reason=parameters.reason,
-        evaluations=parameters.evaluations,
-        solve_time_ms=parameters.solve_time_ms,
-        at_bound=parameters.at_bound,
-        undetermined=parameters.undetermined,
-        details=parameters.details,
-    )

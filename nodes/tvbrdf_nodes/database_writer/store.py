@@ -16,12 +16,13 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self
 
 from tvbrdf_fitting.published.database import (
     DatabaseError,
     DiskFullError,
     StoredDatabase,
+    StoredScan,
     read_database,
     sample_folder_name,
 )
@@ -41,8 +42,6 @@ from .records import (
 if TYPE_CHECKING:  # SQLAlchemy takes 0.4 s to import: it is loaded when a database is opened
     from sqlalchemy.orm import Session
 
-    from .catalogue import Scan
-
 __all__ = [
     "DatabaseError",
     "DatabaseStore",
@@ -59,6 +58,21 @@ Outcome = Literal["stored", "already_stored"]
 _SAMPLE_NUMBER = 1
 
 _logger = logging.getLogger(__name__)
+
+
+class Contents(NamedTuple):
+    """What a database holds; times on the run's clock."""
+
+    scans: tuple[int, ...]
+    """Numbers of the measured scans, in order."""
+    fitted: tuple[int, ...]
+    """Of those whose parameters are stored."""
+    missing: dict[int, str]
+    """Of those that could not be measured, and why."""
+    zero_ns: int
+    """t = 0: the last zero note, else from the first scan, else 0."""
+    last_ns: int
+    """The latest scan, measured or missing; 0 if none is known."""
 
 
 class DatabaseStore:
@@ -238,39 +252,41 @@ class DatabaseStore:
                 added = add_note(session, self._sample_id, stamp_ns, text, zero=zero)
         return "stored" if added else "already_stored"
 
-    def stored_scans(self) -> tuple[int, ...]:
-        """Numbers of the measured scans, in order."""
-        return tuple(scan.number for scan in self._scans() if scan.state == "measured")
-
-    def fitted_scans(self) -> tuple[int, ...]:
-        """Numbers of the scans whose parameters are stored, in order."""
-        return tuple(scan.number for scan in self._scans() if scan.fit is not None)
-
-    def missing_scans(self) -> dict[int, str]:
-        """Numbers of the scans that could not be measured, in order, and why."""
-        return {scan.number: scan.reason for scan in self._scans() if scan.state == "missing"}
-
-    def zero_ns(self) -> int:
-        """Run-clock time of t = 0: the last zero note, else from the first scan, else 0."""
+    def contents(self) -> Contents:
+        """Return which scans there are, and when."""
         from sqlalchemy import select
 
-        from .catalogue import Note
+        from .catalogue import Fit, Note, Scan
 
+        numbers = (Scan.number, Scan.state, Scan.reason, Scan.start_stamp_ns, Scan.time_s)
+        scans = select(*numbers, Fit.scan_id).outerjoin(Fit, Fit.scan_id == Scan.id)
+        scans = scans.where(Scan.sample_id == self._sample_id).order_by(Scan.number)
+        zero = select(Note.stamp_ns).where(Note.sample_id == self._sample_id, Note.zero)
         with explained(self.path, "reading it"), self._session() as session:
-            zero = select(Note.stamp_ns).where(Note.sample_id == self._sample_id, Note.zero)
             marked = session.scalar(zero.order_by(Note.stamp_ns.desc()).limit(1))
-        if marked is not None:
-            return marked
-        for scan in self._scans():
-            if scan.start_stamp_ns is not None and scan.time_s is not None:
-                return scan.start_stamp_ns - round(scan.time_s * 1e9)
-        return 0
+            rows = session.execute(scans).all()
+        first = (
+            row.start_stamp_ns - round(1e9 * row.time_s)
+            for row in rows
+            if row.start_stamp_ns is not None and row.time_s is not None
+        )
+        zero_ns = next(first, 0) if marked is None else marked
+        last_s = max((row.time_s for row in rows if row.time_s is not None), default=None)
+        return Contents(
+            scans=tuple(row.number for row in rows if row.state == "measured"),
+            fitted=tuple(row.number for row in rows if row.scan_id is not None),
+            missing={row.number: row.reason for row in rows if row.state == "missing"},
+            zero_ns=zero_ns,
+            last_ns=0 if last_s is None or not zero_ns else zero_ns + round(1e9 * last_s),
+        )
 
-    def last_ns(self) -> int:
-        """Run-clock time of the latest scan, measured or missing; 0 if none is known."""
-        zero_ns, scans = self.zero_ns(), self._scans()
-        times = [scan.time_s for scan in scans if scan.time_s is not None]
-        return zero_ns + round(1e9 * max(times)) if zero_ns and times else 0
+    def unfitted(self) -> tuple[StoredScan, ...]:
+        """Measured scans without parameters, in order."""
+        contents = self.contents()
+        if contents.scans == contents.fitted:
+            return ()
+        (sample,) = read_database(self.path).samples
+        return tuple(scan for scan in sample.scans if scan.fit is None)
 
     def check_sample(self, sample: str) -> None:
         """Refuse what is of another sample."""
@@ -293,16 +309,6 @@ class DatabaseStore:
     def _transaction(self) -> Iterator[Session]:
         with self._session() as session, session.begin():
             yield session
-
-    def _scans(self) -> list[Scan]:
-        from sqlalchemy import select
-        from sqlalchemy.orm import joinedload
-
-        from .catalogue import Scan
-
-        query = select(Scan).where(Scan.sample_id == self._sample_id).order_by(Scan.number)
-        with explained(self.path, "reading it"), self._session() as session:
-            return list(session.scalars(query.options(joinedload(Scan.fit))).all())
 
     def _measured_digest(self, number: int) -> str | None:
         from .entries import find_scan

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import Parameters, Radiance, Stored
 
 from ..core.device import DeviceError
-from ..core.node import Node, Outputs, Release, Send, TopicUse
+from ..core.node import Node, NodeContext, Outputs, Release, Send, TopicUse
 
 if TYPE_CHECKING:
     from tvbrdf_fitting.inference.nuisances import CommonErrors
@@ -19,6 +20,22 @@ if TYPE_CHECKING:
 
 
 AUTO = "auto"
+METHOD = "separable"
+_OF_SCAN = ("sample", "scan", "scan_time_s")
+_OF_RESULT = (
+    "model",
+    "parameter_names",
+    "at_bound",
+    "undetermined",
+    "chi_square",
+    "degrees_of_freedom",
+    "model_error_std",
+    "reason",
+    "solver",
+    "evaluations",
+    "covariance",
+)
+"""What parameters have from their scan's radiance and from its fit, under the same names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +44,7 @@ class FitterParameters:
 
     model: str = "oren_nayar+torrance_sparrow"
     """Or ``auto``: the simplest that explains the data, and kept while the next scans allow."""
-    method: str = "separable"
+    method: str = METHOD
     metric: str = "radiance"
     loss: str = "least_squares"
     fixed: dict[str, Any] = field(default_factory=dict)
@@ -48,6 +65,14 @@ class FitterNode(Node[FitterParameters]):
     parameters_type = FitterParameters
     drains = True
 
+    def __init__(self, context: NodeContext, parameters: FitterParameters) -> None:
+        super().__init__(context, parameters)
+        _check(parameters)
+        self._kept: dict[str, str] = {}
+        """The model chosen for a sample's last scan."""
+        self._unstored: set[tuple[int, int]] = set()
+        """Scan and attempt of parameters that were sent and are not stored yet."""
+
     @classmethod
     def topics(cls, name: str, parameters: FitterParameters) -> TopicUse:
         """See :class:`~tvbrdf_nodes.core.node.Node`."""
@@ -57,37 +82,33 @@ class FitterNode(Node[FitterParameters]):
         )
 
     def prepare(self) -> None:
-        """Load the solver, and refuse an unknown model or fixed parameter before anything moves."""
-        from tvbrdf_fitting.fit import LOSSES, METRICS, SOLVERS  # takes most of a second
-        from tvbrdf_fitting.models import get_model
+        """Load the solver; what is sent meanwhile waits."""
+        import tvbrdf_fitting.fit  # takes most of a second
         from tvbrdf_fitting.solve import separable
 
-        given = self.parameters
-        for name, known in (("method", SOLVERS), ("metric", METRICS), ("loss", LOSSES)):
-            if getattr(given, name) not in known:
-                raise DeviceError(
-                    f"{name}: {getattr(given, name)!r} is unknown; known: {', '.join(known)}"
-                )
         separable.compile_all()
-        self._kept: dict[str, str] = {}
-        if given.model == AUTO:
+        if self.parameters.model == AUTO:
             import tvbrdf_fitting.choice.choose  # noqa: F401
 
-            return
-        try:
-            names = get_model(given.model).parameter_names
-        except ValueError as error:
-            raise DeviceError(f"model: {error}") from error
-        unknown = sorted(set(given.fixed) - set(names))
-        if unknown:
-            raise DeviceError(f"fixed: {', '.join(unknown)}: {given.model} has {', '.join(names)}")
+    def on_epoch(self, epoch: int) -> Outputs:
+        """Forget the model of the scan before: a replay has jumped, and begins anew."""
+        self._kept.clear()
+        return ()
 
     def handle(self, envelope: Envelope) -> Outputs:
-        """Fit a scan; forget one that is stored."""
+        """Fit a scan; forget one that is stored.
+
+        Merger and database may both send a scan to a fitter that was restarted.
+        """
         message = envelope.message
         if isinstance(message, Radiance):
-            yield Send(topic="/scan/parameters", message=self._fit(message), keep=str(message.scan))
+            key = (message.scan, message.attempt)
+            if key not in self._unstored:
+                self._unstored.add(key)
+                fitted = self._fit(message)
+                yield Send(topic="/scan/parameters", message=fitted, keep=str(message.scan))
         elif isinstance(message, Stored) and message.what == "parameters":
+            self._unstored = {key for key in self._unstored if key[0] != message.scan}
             yield Release("/scan/parameters", str(message.scan))
 
     def _fit(self, radiance: Radiance) -> Parameters:
@@ -139,50 +160,58 @@ class FitterNode(Node[FitterParameters]):
         return _parameters(radiance, choice.result, {"choice": why})
 
 
+def _check(given: FitterParameters) -> None:
+    """Refuse what is unknown before anything moves."""
+    from tvbrdf_fitting.metrics import METRICS
+    from tvbrdf_fitting.models import get_model
+    from tvbrdf_fitting.solve.losses import LOSSES
+
+    known: dict[str, Iterable[str]] = {"metric": METRICS, "loss": LOSSES}
+    if given.method != METHOD:  # the others take long to load
+        from tvbrdf_fitting.solve.solvers import SOLVERS
+
+        known["method"] = SOLVERS
+    for name, names in known.items():
+        value = getattr(given, name)
+        if value not in names:
+            raise DeviceError(f"{name}: {value!r} is unknown; known: {', '.join(names)}")
+    if given.model == AUTO:
+        return
+    try:
+        parameter_names = get_model(given.model).parameter_names
+    except ValueError as error:
+        raise DeviceError(f"model: {error}") from error
+    unknown = sorted(set(given.fixed) - set(parameter_names))
+    if unknown:
+        raise DeviceError(
+            f"fixed: {', '.join(unknown)}: {given.model} has {', '.join(parameter_names)}"
+        )
+
+
 def observations(radiance: Radiance) -> Observations:
     """Return the observations that a message carries."""
     from tvbrdf_fitting.observations import Observations
 
-    return Observations(
-        light_direction=radiance.light_direction,
-        view_direction=radiance.view_direction,
-        radiance=radiance.radiance,
-        variance=radiance.variance,
-        valid=radiance.valid,
-        camera=radiance.camera,
-        sweep=radiance.sweep,
-        exposure_ms=radiance.exposure_ms,
-        time_s=radiance.scan_time_s + (radiance.stamp_ns - radiance.scan_start_ns) / 1e9,
-    )
+    names = [part.name for part in fields(Observations) if part.name != "time_s"]
+    since_start_s = (radiance.stamp_ns - radiance.scan_start_ns) / 1e9
+    return Observations(**_copied(radiance, names), time_s=radiance.scan_time_s + since_start_s)
+
+
+def _copied(source: Any, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(source, name) for name in names}
 
 
 def _parameters(radiance: Radiance, result: FitResult, more: dict[str, Any]) -> Parameters:
+    nuisances = {name: list(pair) for name, pair in result.nuisances.items()}
+    details = _copied(result, ("metric", "loss", "down_weighted"))
     return Parameters(
-        sample=radiance.sample,
-        scan=radiance.scan,
-        scan_time_s=radiance.scan_time_s,
-        model=result.model,
-        parameter_names=result.parameter_names,
+        **_copied(radiance, _OF_SCAN),
+        **_copied(result, _OF_RESULT),
         values=tuple(result.values.tolist()),
         standard_deviations=tuple(result.standard_deviations.tolist()),
-        at_bound=result.at_bound,
-        undetermined=result.undetermined,
         errors=result.errors.as_dict(),
-        chi_square=result.chi_square,
-        degrees_of_freedom=result.degrees_of_freedom,
-        model_error_std=result.model_error_std,
-        reason=result.reason,
-        solver=result.solver,
-        evaluations=result.evaluations,
         solve_time_ms=1e3 * result.solve_time_s,
-        details={
-            "metric": result.metric,
-            "loss": result.loss,
-            "down_weighted": result.down_weighted,
-            "nuisances": {name: list(pair) for name, pair in result.nuisances.items()},
-            **more,
-        },
-        covariance=result.covariance,
+        details={**details, "nuisances": nuisances, **more},
     )
 
 
@@ -193,18 +222,16 @@ def _unfitted(radiance: Radiance, model: str, reason: str) -> Parameters:
     from tvbrdf_fitting.models import SURFACE, get_model
 
     chosen = get_model(SURFACE if model == AUTO else model)
-    count = len(chosen.parameter_names)
-    nothing = (math.nan,) * count
+    names = chosen.parameter_names
+    nothing = (math.nan,) * len(names)
     return Parameters(
-        sample=radiance.sample,
-        scan=radiance.scan,
-        scan_time_s=radiance.scan_time_s,
+        **_copied(radiance, _OF_SCAN),
         model=chosen.name,
-        parameter_names=chosen.parameter_names,
+        parameter_names=names,
         values=nothing,
         standard_deviations=nothing,
         at_bound=(),
-        undetermined=chosen.parameter_names,
+        undetermined=names,
         errors={},
         chi_square=math.nan,
         degrees_of_freedom=0,
@@ -214,5 +241,5 @@ def _unfitted(radiance: Radiance, model: str, reason: str) -> Parameters:
         evaluations=0,
         solve_time_ms=0.0,
         details={},
-        covariance=np.full((count, count), math.nan),
+        covariance=np.full((len(names), len(names)), math.nan),
     )

@@ -8,7 +8,6 @@ how it arrived. So a refit of what was recorded equals the live run.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tvbrdf_messages.envelope import Envelope
@@ -17,6 +16,7 @@ from tvbrdf_messages.topics import frame_topic
 
 from ..core.device import DeviceError
 from ..core.node import Node, NodeContext, Outputs, Release, Send, TopicUse
+from .calibration_source import check_calibration, read_calibration
 from .sweep import (
     ReducedFrame,
     Sweep,
@@ -47,7 +47,7 @@ class HdrMergerParameters:
     """Whose frames are merged, and how their codes become radiance."""
 
     calibration: str
-    """Path of the calibration file."""
+    """Path of the calibration file, or of a bag that has one inside."""
     cameras: tuple[str, ...] = ("camera_1", "camera_2", "camera_3", "camera_4")
     """In the calibration's order: the first is its camera 1."""
     arm: str = "arm"
@@ -55,11 +55,12 @@ class HdrMergerParameters:
     """Of the frames, where it is not the calibration's."""
     correct_motion_blur: bool = True
     """Frames average over the light's way during their exposure; only a simulation may not."""
+    replayed: bool = False
+    """A player tells what was commanded, where it moves nothing (``/replay/command``)."""
 
     def __post_init__(self) -> None:
         """Refuse a calibration that is not there, before anything starts."""
-        if not Path(self.calibration).is_file():
-            raise ValueError(f"calibration {self.calibration} is no file; give the rig's own")
+        check_calibration(self.calibration)
 
 
 class HdrMergerNode(Node[HdrMergerParameters]):
@@ -88,7 +89,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         return TopicUse(
             takes=(
                 "/clock",
-                "/scan/command",
+                "/replay/command" if parameters.replayed else "/scan/command",
                 "/scan/sweep_result",
                 "/scan/stored",
                 "/arm/state",
@@ -102,12 +103,12 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         import cv2
 
         import tvbrdf_fitting.measurement.light_grid  # noqa: F401 - loaded now rather than in the first scan
-        from tvbrdf_fitting.measurement.calibration import CalibrationError, load_calibration
+        from tvbrdf_fitting.measurement.calibration import CalibrationError
         from tvbrdf_fitting.measurement.frame_reduction import FrameReducer
 
         cv2.setNumThreads(1)
         try:
-            calibration = load_calibration(self.parameters.calibration)
+            calibration = read_calibration(self.parameters.calibration)
             bit_depth = self.parameters.bit_depth
             if bit_depth is not None:
                 cameras = tuple(c.with_bit_depth(bit_depth) for c in calibration.cameras)
@@ -119,6 +120,13 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         self._calibration = calibration
 
     # -- what comes in
+
+    def on_epoch(self, epoch: int) -> Outputs:
+        """Empty all buffers: a replay has jumped."""
+        for buffer in (self._sweeps, self._states, self._commands, self._dark, self._done):
+            buffer.clear()
+        self._refused = None
+        return ()
 
     def handle(self, envelope: Envelope) -> Outputs:
         """Take frames, states, commands and end-of-sweep marks."""

@@ -27,6 +27,7 @@ from .requests import FORWARDED, VERBS, RequestError, Requests, as_command, note
 from .schedule import Schedule
 from .storage import Storage
 
+FITTER = "fitter"
 MERGER = "hdr_merger"
 WRITER = "database_writer"
 _IDLE = ("interval", "waiting for the operator")
@@ -44,9 +45,13 @@ class SequencerNode(Node[SequencerParameters]):
         super().__init__(context, parameters)
         self._state = "waiting for nodes"
         self._nodes = {
-            p.name for p in context.graph.participants if p.node and "/diagnostics" in p.gives
+            p.name
+            for p in context.graph.participants
+            if p.node and "/diagnostics" in p.gives and not p.counted_bytes
         } - {context.name}
-        self._running: set[str] = set()
+        """Those that it can't do without: for one that is only counted nobody waits."""
+        self._states: dict[str, str] = {}
+        """Of each node, as it last told."""
         self._lost: set[str] = set()
         self._database: DatabaseState | None = None
         self._schedule = Schedule(parameters.interval_s)
@@ -94,19 +99,17 @@ class SequencerNode(Node[SequencerParameters]):
         elif isinstance(message, Stored):
             yield from self._take_stored(message)
         elif isinstance(message, DatabaseState):
-            self._database = message
-            yield from self._begin_when_ready()
+            yield from self._take_database(message)
         elif isinstance(message, Diagnostics):
+            self._states[message.node] = message.state
             if message.state == "running":
-                self._running.add(message.node)
                 yield from self._take_running(message.node)
-            else:
-                self._running.discard(message.node)
+            yield from self._begin_when_ready()
 
     def on_lost(self, publisher: str) -> Outputs:
         """A node's process is gone: whatever sweep it took part in is broken."""
         node = publisher.removesuffix(".device")
-        self._running.discard(node)
+        self._states.pop(node, None)
         if node not in self._nodes or node in self._lost:
             return
         self._lost.add(node)
@@ -127,7 +130,6 @@ class SequencerNode(Node[SequencerParameters]):
             self.context.log.info(f"{node} is back")
             if not self._lost and self._state == "waiting for a restart":
                 yield from self._resume()
-        yield from self._begin_when_ready()
 
     def on_timer(self, name: str) -> Outputs:
         """Begin the scan that is due, go on after a wait, or give up on a device."""
@@ -147,16 +149,26 @@ class SequencerNode(Node[SequencerParameters]):
 
     # -- from start to the first scan
 
+    def _take_database(self, database: DatabaseState) -> Outputs:
+        """Take what the database holds; only what it held at first is news."""
+        unfitted = sorted({*database.scans} - {*database.fitted})
+        if self._database is None and unfitted:
+            self.context.log.info(f"scans {unfitted} are stored, not fitted; they are fitted now")
+            self._storage.expect_parameters(unfitted)
+        self._database = database
+        yield from self._begin_when_ready()
+
     def _begin_when_ready(self) -> Outputs:
+        """Begin when all nodes run; the fitter may still load, what is sent to it waits."""
         database = self._database
         if self._state != "waiting for nodes" or database is None:
             return
-        if not self._nodes <= self._running:
+        states = {node: self._states.get(node) for node in self._nodes}
+        if states.get(FITTER) == "ready":
+            del states[FITTER]
+        if set(states.values()) - {"running"}:
             return
         self._schedule.go_on_from(database)
-        unfitted = sorted({*database.scans} - {*database.fitted})
-        if unfitted:
-            self.context.log.warning(f"scans {unfitted} of an earlier run are stored, not fitted")
         if self._hold or self._schedule.next_scan > self.parameters.scans:
             yield from self._wait_for_slot()
         else:

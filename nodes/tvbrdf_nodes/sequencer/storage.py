@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from tvbrdf_messages.messages import ScanMissing, Stored
 
 from ..core.node import Exit, Logger, Outputs, Release, Send
@@ -24,12 +26,18 @@ class Storage:
         self._wanted: dict[int, Scan] = {}
         self._on_disk: set[int] = set()
         """Scans of which the radiance is stored."""
+        self._unfitted: set[int] = set()
+        """Of those that were on disk at the beginning: their parameters are still to come."""
         self._missing: list[str] = []
         self._refused: list[str] = []
 
     def expect(self, scan: Scan) -> None:
         """A scan begins: something of it must come to the disk."""
         self._wanted[scan.number] = scan
+
+    def expect_parameters(self, scans: Iterable[int]) -> None:
+        """Scans were on disk before, but not fitted."""
+        self._unfitted.update(scans)
 
     def missing(self, scan: Scan, reason: str) -> Outputs:
         """Record a scan as missing."""
@@ -60,6 +68,7 @@ class Storage:
             self._on_disk.add(stored.scan)
         if stored.what in ("parameters", "missing"):
             self._wanted.pop(stored.scan, None)
+            self._unfitted.discard(stored.scan)
 
     def unsaved(self, current: Scan | None) -> list[Scan]:
         """Return the scans before the current one of which no database has seen the radiance."""
@@ -72,7 +81,7 @@ class Storage:
 
     def end(self) -> Exit | None:
         """Return how the run ends, once nothing is wanted any more."""
-        if self._wanted:
+        if self._wanted or self._unfitted:
             return None
         if self._refused:
             return Exit(1, self._refused[-1])

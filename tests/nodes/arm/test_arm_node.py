@@ -12,7 +12,6 @@ from tvbrdf_messages.messages import Diagnostics
 
 Make = Callable[..., Any]
 SWEEP = {"from_deg": -90.0, "to_deg": 90.0, "duration_s": 12.0, "scan": 2, "sweep": 1}
-S = 10**9
 
 
 def begin_sweep(rig: Any, **fields: Any) -> int:

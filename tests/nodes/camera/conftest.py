@@ -23,7 +23,8 @@ from tvbrdf_messages.messages import (
 )
 from tvbrdf_messages.run_directory import Graph, Participant
 from tvbrdf_nodes.camera.driver import CameraSettings
-from tvbrdf_nodes.camera.node import CameraNode, CameraParameters
+from tvbrdf_nodes.camera.node import CameraNode
+from tvbrdf_nodes.camera.parameters import CameraParameters
 from tvbrdf_nodes.camera.simulated import SimulatedCamera
 from tvbrdf_nodes.camera.simulated_bench import ZERO_NS, SimulatedBench
 from tvbrdf_nodes.camera.simulated_image import SimulatedCameraParameters

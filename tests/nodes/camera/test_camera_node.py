@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
+from tests.nodes.camera.conftest import NAME, Rig
 from tvbrdf_messages.messages import CameraInfo, Frame, ScanCommand
 
-NAME = "camera_2"
-Rig = Any
-"""See conftest.py."""
 MakeRig = Callable[..., Rig]
 
 

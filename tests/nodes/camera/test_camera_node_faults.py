@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import pytest
 
+from tests.nodes.camera.conftest import NAME, Rig
 from tvbrdf_messages.errors import BusError
 from tvbrdf_messages.messages import Frame
 from tvbrdf_nodes.camera.capture import FrameOrder
@@ -16,9 +17,6 @@ from tvbrdf_nodes.camera.simulated import SimulatedCamera
 from tvbrdf_nodes.core.device import DeviceError
 from tvbrdf_nodes.core.parameters import ParameterError
 
-NAME = "camera_2"
-Rig = Any
-"""See conftest.py."""
 MakeRig = Callable[..., Rig]
 
 

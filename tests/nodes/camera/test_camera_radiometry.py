@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.nodes.camera.simulated_frames import TAG, MakeBench, middle_ns
 from tvbrdf_fitting.geometry import CAMERA_ANGLES_DEG, light_direction, view_direction
 from tvbrdf_fitting.models import get_model
 from tvbrdf_messages.messages import SimMotion
-from tvbrdf_nodes.camera.driver import CameraSettings, CaptureTag, RawFrame, Region
+from tvbrdf_nodes.camera.driver import CameraSettings, Region
 from tvbrdf_nodes.camera.simulated_bench import (
     ZERO_NS,
-    SimulatedBench,
     resting_light,
     sweeping_light,
 )
@@ -25,24 +24,6 @@ from tvbrdf_nodes.world.sample import make_sample
 from tvbrdf_nodes.world.scene import CameraEffects, LampEffects
 
 BLACK_DN, DN_PER_RADIANCE_MS = 64.0, 604.65
-REALISTIC = CameraEffects(
-    shot_noise=True,
-    read_noise=True,
-    quantisation=True,
-    motion_blur=True,
-    clock_offset_s=5.0,
-    clock_drift_ppm=30.0,
-    jitter_ms=0.5,
-    relative_noise_std=0.001,
-    gain_error_std=0.002,
-)
-TAG = CaptureTag(sample="s", scan=1, sweep=2, attempt=1)
-MakeBench = Callable[..., SimulatedBench]
-
-
-def middle_ns(frame: RawFrame, delay_ms: float = 5.0) -> int:
-    """Middle of the exposure of a frame that came without jitter."""
-    return frame.received_ns - round(1e6 * (delay_ms + frame.exposure_ms / 2))
 
 
 def test_mean_codes_follow_the_formula(make_bench: MakeBench, folder: Path) -> None:

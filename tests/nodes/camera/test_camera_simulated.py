@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.nodes.camera.simulated_frames import TAG, MakeBench, middle_ns
 from tvbrdf_messages.messages import SimGrant
 from tvbrdf_nodes.camera.conformance import check_camera_driver
-from tvbrdf_nodes.camera.driver import CameraSettings, CaptureTag, RawFrame
+from tvbrdf_nodes.camera.driver import CameraSettings, RawFrame
 from tvbrdf_nodes.camera.simulated_bench import (
     STEP_NS,
     ZERO_NS,
@@ -24,7 +24,6 @@ from tvbrdf_nodes.core.device import DeviceError
 from tvbrdf_nodes.world.sample import make_sample
 from tvbrdf_nodes.world.scene import CameraEffects, Scene
 
-BLACK_DN, DN_PER_RADIANCE_MS = 64.0, 604.65
 REALISTIC = CameraEffects(
     shot_noise=True,
     read_noise=True,
@@ -36,13 +35,6 @@ REALISTIC = CameraEffects(
     relative_noise_std=0.001,
     gain_error_std=0.002,
 )
-TAG = CaptureTag(sample="s", scan=1, sweep=2, attempt=1)
-MakeBench = Callable[..., SimulatedBench]
-
-
-def middle_ns(frame: RawFrame, delay_ms: float = 5.0) -> int:
-    """Middle of the exposure of a frame that came without jitter."""
-    return frame.received_ns - round(1e6 * (delay_ms + frame.exposure_ms / 2))
 
 
 def test_frames_run_on_the_cameras_own_clock(make_bench: MakeBench) -> None:
@@ -144,7 +136,7 @@ def test_trigger_takes_one_frame_each(make_bench: MakeBench) -> None:
     assert bench.read() == []
 
 
-def test_sample_changes_during_a_scan_only_when_told(tmp_path: Path, folder: Path) -> None:
+def test_sample_changes_during_a_scan_only_when_told(folder: Path) -> None:
     """Frames show the sample at the scan's time, or at their own."""
     spec = {"kind": "measured", "path": str(folder)}
     asked: list[float] = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -61,7 +60,7 @@ def ports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, Any, 
 
 
 def test_takes_part_over_sockets(
-    ports: tuple[ZmqPort, ZmqPort, SimulatedCamera], tmp_path: Path
+    ports: tuple[ZmqPort, ZmqPort, SimulatedCamera],
 ) -> None:
     world, arm, driver = ports
     poller = zmq.Poller()

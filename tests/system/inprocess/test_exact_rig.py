@@ -17,7 +17,7 @@ from tvbrdf_nodes.world.scene import load_scene
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from conftest import MakeSample, Run, RunRig
+    from tests.system.inprocess.conftest import MakeSample, Run, RunRig
 
 # Kd B, G, R, sigma_d, Ks, 1/sigma_s
 MATERIALS = {

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
+from tvbrdf_launch.testing.inprocess import InProcessRun
 from tvbrdf_messages.codec import encode
 from tvbrdf_messages.envelope import Envelope, Header
 from tvbrdf_messages.messages import Mark
 from tvbrdf_messages.topics import find_topic
-from tvbrdf_nodes.core.inprocess import InProcessGraph
 from tvbrdf_nodes.world import scene
 
 if TYPE_CHECKING:
-    from conftest import Run, RunRig
+    from tests.system.inprocess.conftest import Run, RunRig
 
 EFFECTS = Path(scene.__file__).parent / "effects"
 SEEDS = 4
@@ -79,22 +79,14 @@ def found(messages: list[Envelope]) -> list[bytes]:
 
 def refit(run: Run, order: Callable[[Queues], Iterator[Envelope]]) -> list[bytes]:
     """Feed what was recorded to a fresh merger and fitter; each publisher's own order is kept."""
-    with InProcessGraph(run.graph, run=NODES) as graph:
-        ports = {name: graph.bus.ports[name] for name in NODES}
-        takes = {name: run.graph.find(name).takes for name in NODES}
-        queues: Queues = defaultdict(deque)
-        for envelope in run.messages:
-            if envelope.header.publisher not in NODES:
-                queues[envelope.header.publisher].append(envelope)
-        for envelope in order(queues):
-            if envelope.topic == "/clock":
-                continue  # neither has a timer
-            for name in NODES:
-                if envelope.topic in takes[name]:
-                    ports[name].take(envelope)
-            while graph.step():
-                pass
-        return found(graph.bus.taps)
+    queues: Queues = defaultdict(deque)
+    for envelope in run.messages:
+        queues[envelope.header.publisher].append(envelope)
+    for name in NODES:
+        queues.pop(name, None)
+    with InProcessRun(run.graph, NODES) as nodes:
+        nodes.feed(order(queues))
+        return found([told.envelope for told in nodes.history])
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ import pytest
 from scipy.stats import binomtest, norm
 
 from tvbrdf_fitting.geometry import light_world_angle_deg
-from tvbrdf_fitting.published.scan import CameraScan, read_scan
+from tvbrdf_fitting.published import CameraScan, read_scan
 
 if TYPE_CHECKING:
-    from conftest import MakeSample, RunRig
+    from tests.system.inprocess.conftest import MakeSample, RunRig
 
 SCANS = 20
 WITHIN_3 = norm.cdf(3) - norm.cdf(-3)

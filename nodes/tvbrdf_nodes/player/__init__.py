@@ -1,0 +1,1 @@
+"""The player: publishes what a bag holds, with the run's clock."""

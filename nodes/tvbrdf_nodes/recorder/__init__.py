@@ -1,0 +1,1 @@
+"""The recorder: what a run says, in a bag."""
