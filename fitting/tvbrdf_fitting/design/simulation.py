@@ -22,6 +22,8 @@ from .search import Design, DesignStudy, make_design
 
 CONFIDENCE = 0.95
 MOST_TRIALS = 8
+_LARGEST = 1e140
+"""Error beyond which it does not matter how large it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +81,8 @@ def simulate_design(
     if scans < 2:
         raise ValueError(f"{scans} scans: at least two are needed")
     errors = _Fits(information, design).errors(scans, np.random.default_rng(seed))
+    # a lobe that nobody sees can have an amplitude of 1e200, whose square is no number
+    errors = np.clip(errors, -_LARGEST, _LARGEST)
     model, free = information.model, list(information.free)
     internal = design.predicted.internal[free]
     known = np.isfinite(internal) & (internal > 0)

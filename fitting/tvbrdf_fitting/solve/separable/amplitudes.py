@@ -204,21 +204,39 @@ def triangulate(diffuse, triangles):
 
 
 @njit(**JIT)
-def lower_bound(triangles, lobes, coloured):
+def reduce_lobe(triangles, lobes, reduced):
+    """Write a lobe's coordinates along the vectors and what it is beyond them, squared: (3, 4)."""
+    for c in range(3):
+        t, a, r = triangles[c], lobes[c], reduced[c]
+        r[0] = _quotient(a[0], t[0])
+        r[1] = _quotient(a[1] - t[1] * r[0], t[3])
+        r[2] = _quotient(a[2] - t[2] * r[0] - t[4] * r[1], t[5])
+        r[3] = a[3] - r[0] * r[0] - r[1] * r[1] - r[2] * r[2]
+
+
+@njit(**JIT)
+def reduced_lobes(diffuse, lobes):
+    """Return what `reduce_lobe` makes of lobes (w, 3, 5): (w, 3, 4)."""
+    triangles, reduced = np.empty((3, 9)), np.empty((lobes.shape[0], 3, 4))
+    triangulate(diffuse, triangles)
+    for k in range(lobes.shape[0]):
+        reduce_lobe(triangles, lobes[k], reduced[k])
+    return reduced
+
+
+@njit(**JIT)
+def lower_bound(triangles, lobes, reduced, coloured):
     """Return what no s and no amplitudes can get the cost at a width below, less a constant.
 
     The three diffuse vectors of each channel are given free factors, which is a linear problem.
+    `reduced` is what `reduce_lobe` makes of the lobe.
     """
     total, curvature, downhill = 0.0, 0.0, 0.0
     for c in range(3):
-        t, a = triangles[c], lobes[c]
-        one = _quotient(a[0], t[0])
-        two = _quotient(a[1] - t[1] * one, t[3])
-        three = _quotient(a[2] - t[2] * one - t[4] * two, t[5])
-        square = a[3] - one * one - two * two - three * three
-        slope = a[4] - one * t[6] - two * t[7] - three * t[8]
+        t, r, square = triangles[c], reduced[c], reduced[c, 3]
+        slope = lobes[c, 4] - r[0] * t[6] - r[1] * t[7] - r[2] * t[8]
         total -= 0.5 * (t[6] * t[6] + t[7] * t[7] + t[8] * t[8])
-        if a[3] > 0 and not square > 1e-7 * a[3]:
+        if lobes[c, 3] > 0 and not square > 1e-7 * lobes[c, 3]:
             return -np.inf  # a lobe like the diffuse vectors: nothing can be said
         if coloured:
             if slope > 0 and square > 0:

@@ -194,33 +194,43 @@ def write_lobe_products(scale, power, data, blocks, falloff, products):
 
 
 @njit(fastmath=SUMS, **JIT)
-def _add_data_products(f, falloff, y0, y1, y2, products):
-    a = b = c = 0.0
-    for i in range(f.shape[0]):
-        lobe = f[i] * falloff[i]
-        a += y0[i] * lobe
-        b += y1[i] * lobe
-        c += y2[i] * lobe
-    products[0, 4] += a
-    products[1, 4] += b
-    products[2, 4] += c
+def _add_data_products(one, other, y0, y1, y2, first, second):
+    a = b = c = d = e = f = 0.0
+    for i in range(one.shape[0]):
+        a += y0[i] * one[i]
+        b += y1[i] * one[i]
+        c += y2[i] * one[i]
+        d += y0[i] * other[i]
+        e += y1[i] * other[i]
+        f += y2[i] * other[i]
+    first[0, 4] += a
+    first[1, 4] += b
+    first[2, 4] += c
+    second[0, 4] += d
+    second[1, 4] += e
+    second[2, 4] += f
 
 
 @njit(**JIT)
-def write_data_products(scale, data, blocks, falloff, products):
-    """Write only the lobe's products with the data, for a `falloff` that is known."""
-    _, f, _, _, _, weighted = data
-    products[:, 4] = 0.0
-    k = 0
-    while k < blocks.shape[0]:
-        first = k
-        while k < blocks.shape[0] and blocks[k] * scale < _OUT:
+def write_data_products(scales, table, blocks, weighted, lobes):
+    """Write only the products with the data, of lobes (w, n) whose scales ascend, into (w, 3, 5).
+
+    Two at a time: reading the data takes longer than multiplying them.
+    """
+    lobes[:, :, 4] = 0.0
+    for m in range(0, scales.shape[0], 2):
+        other = min(m + 1, scales.shape[0] - 1)
+        spare = lobes[other] if other > m else np.empty((3, 5))
+        k = 0
+        while k < blocks.shape[0]:
+            first = k
+            while k < blocks.shape[0] and blocks[k] * scales[m] < _OUT:
+                k += 1
+            if k > first:
+                a, z = first * BLOCK, min(k * BLOCK, table.shape[1])
+                y0, y1, y2 = weighted[0, a:z], weighted[1, a:z], weighted[2, a:z]
+                _add_data_products(table[m, a:z], table[other, a:z], y0, y1, y2, lobes[m], spare)
             k += 1
-        if k > first:
-            a, z = first * BLOCK, min(k * BLOCK, f.shape[0])
-            y0, y1, y2 = weighted[0, a:z], weighted[1, a:z], weighted[2, a:z]
-            _add_data_products(f[a:z], falloff[a:z], y0, y1, y2, products)
-        k += 1
 
 
 @njit(fastmath=SUMS, **JIT)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
+from .amplitudes import reduced_lobes
 from .elementary import JIT, SUMS
 from .equations import (
     nearest,
@@ -103,18 +102,33 @@ def solve_alike(
     data = (vectors, f, shifted(q, nearer), radiance, squares, weighted)
     blocks, us = nearest(data[2]), widths_between(lower, high)
     diffuse, columns = np.empty((3, 9)), np.empty((3, n))
-    lobes, falloffs = np.empty((us.shape[0], 3, 5)), np.empty((us.shape[0], n))
+    lobes, table = np.empty((us.shape[0], 3, 5)), np.empty((us.shape[0], n))
     write_diffuse_products(data, diffuse)
+    scales = np.exp(2 * us)
     for k in range(us.shape[0]):
-        write_lobe_products(math.exp(2 * us[k]), 1, data, blocks, falloffs[k], lobes[k])
+        write_lobe_products(scales[k], 1, data, blocks, table[k], lobes[k])
+        for i in range(n):
+            table[k, i] *= f[i]
+    reduced = reduced_lobes(diffuse, lobes)
     for m in range(xs.shape[0]):
         if not _take_radiance(radiances[m], rows, squares, radiance):
             return m
         energy = write_diffuse_data(data, diffuse)
-        for k in range(us.shape[0]):
-            write_data_products(math.exp(2 * us[k]), data, blocks, falloffs[k], lobes[k])
+        write_data_products(scales, table, blocks, weighted, lobes)
         costs[m], counts[m, 0], counts[m, 1], counts[m, 2] = search(
-            xs[m], form, data, blocks, diffuse, us, lobes, energy, lower, high, columns, tolerance
+            xs[m],
+            form,
+            data,
+            blocks,
+            diffuse,
+            us,
+            lobes,
+            reduced,
+            energy,
+            lower,
+            high,
+            columns,
+            tolerance,
         )
         seen_amplitudes(xs[m], nearer)
     return -1

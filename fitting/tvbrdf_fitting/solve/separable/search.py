@@ -28,6 +28,8 @@ from .amplitudes import (
     best_at_width,
     improve_amplitudes,
     lower_bound,
+    reduce_lobe,
+    reduced_lobes,
     settle,
     triangulate,
 )
@@ -177,7 +179,7 @@ def find_bottoms(
     size, widths = lower.shape[0], us.shape[0]
     count = (widths - 1) * _CLOSER + 1
     costs, bottoms, points = np.full(count, np.inf), np.full(count, np.inf), np.empty((count, size))
-    products, room = np.empty((3, 5)), np.empty((6, 9))
+    products, reduced, room = np.empty((3, 5)), np.empty((3, 4)), np.empty((6, 9))
     margin = 1e-9 * best + 1e-10 * energy
     coloured = size == 8
     for turn in range(_CLOSER):  # the grid, then what lies between
@@ -193,7 +195,8 @@ def find_bottoms(
                     continue
                 u += (us[node + 1] - u) * turn / _CLOSER
                 write_lobe_products(math.exp(2 * u), 1, data, blocks, falloff, products)
-                floor = 0.5 * energy + lower_bound(triangles, products, coloured)
+                reduce_lobe(triangles, products, reduced)
+                floor = 0.5 * energy + lower_bound(triangles, products, reduced, coloured)
                 suspicious = floor < best + margin
             if suspicious:
                 for i in range(size):
@@ -218,18 +221,19 @@ def find_bottoms(
 
 
 @njit(**JIT)
-def search(x, form, data, blocks, diffuse, us, lobes, energy, lower, upper, columns, tolerance):
+def search(
+    x, form, data, blocks, diffuse, us, lobes, reduced, energy, lower, upper, columns, tolerance
+):
     """Descend every valley that could hold the optimum, given all products; see `solve`."""
     size, widths = x.shape[0], us.shape[0]
     triangles, products, room = np.empty((3, 9)), np.empty((3, 5)), np.empty((6, 9))
     floors, start, falloff = np.empty(widths), np.empty(size), columns[0]
     triangulate(diffuse, triangles)
     for k in range(widths):
-        floors[k] = 0.5 * energy + lower_bound(triangles, lobes[k], size == 8)
-    first = int(np.argmin(floors))
+        floors[k] = 0.5 * energy + lower_bound(triangles, lobes[k], reduced[k], size == 8)
     for i in range(size):
         x[i] = clip(0.0, lower[i], upper[i])
-    x[size - 1] = began = width_between(us, floors, first)
+    x[size - 1] = began = width_between(us, floors, int(np.argmin(floors)))
     write_lobe_products(math.exp(2 * began), 1, data, blocks, falloff, products)
     _, elsewhere = best_at_width(x, form, diffuse, products, lower, upper, ROUGH, room)
     best, evaluations, status = descend(
@@ -339,8 +343,21 @@ def solve_weighted(x, form, data, lower, upper, tolerance):
     us = widths_between(lower, high)
     lobes = np.empty((us.shape[0], 3, 5))
     write_sweep(us, data, blocks, columns[0], lobes)
+    reduced = reduced_lobes(diffuse, lobes)
     found = search(
-        x, form, data, blocks, diffuse, us, lobes, energy, lower, high, columns, tolerance
+        x,
+        form,
+        data,
+        blocks,
+        diffuse,
+        us,
+        lobes,
+        reduced,
+        energy,
+        lower,
+        high,
+        columns,
+        tolerance,
     )
     seen_amplitudes(x, nearer)
     return found
