@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import tempfile
 import textwrap
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.launch.published_samples import Fit, fit_with, write_sample
 from tests.launcher_process import LauncherProcess
 
 HERE = Path(__file__).parent
@@ -90,3 +92,19 @@ def run(tmp_path: Path) -> Iterator[Run]:
     one = Run(Path(tempfile.mkdtemp(prefix="tv-")), tmp_path)
     with one.cleared():
         yield one
+
+
+@pytest.fixture(name="fit")
+def fit_fixture(capsys: pytest.CaptureFixture[str]) -> Fit:
+    return fit_with(capsys)
+
+
+@pytest.fixture(scope="module")
+def sample_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_sample(tmp_path_factory.mktemp("once") / "red_paint")
+
+
+@pytest.fixture
+def sample(sample_once: Path, tmp_path: Path) -> Path:
+    """A sample with one scan, to be broken."""
+    return shutil.copytree(sample_once, tmp_path / "red_paint")

@@ -19,7 +19,6 @@ from tests.launch.published_samples import (
     START_NS,
     Fit,
     file_of,
-    fit_with,
     grid_of,
     observe,
     truth_of,
@@ -36,25 +35,6 @@ from tvbrdf_fitting.published import (
     write_info,
 )
 from tvbrdf_nodes.database_writer.store import DatabaseStore, ScanRecord
-
-
-@pytest.fixture(name="fit")
-def fit_fixture(capsys: pytest.CaptureFixture[str]) -> Fit:
-    return fit_with(capsys)
-
-
-@pytest.fixture(scope="module")
-def sample_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sample(tmp_path_factory.mktemp("once") / "red_paint")
-
-
-@pytest.fixture
-def sample(sample_once: Path, tmp_path: Path) -> Path:
-    """A sample with one scan, to be broken."""
-    return shutil.copytree(sample_once, tmp_path / "red_paint")
-
-
-# -- what it prints and writes
 
 
 def test_one_scan_is_printed_in_full(fit: Fit, sample: Path) -> None:

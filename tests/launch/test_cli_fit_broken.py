@@ -15,7 +15,6 @@ from tests.launch.published_samples import (
     Fit,
     edit,
     file_of,
-    fit_with,
     folder_instead,
     no_files,
     replaced,
@@ -24,23 +23,6 @@ from tests.launch.published_samples import (
     write_fits,
     write_sample,
 )
-
-
-@pytest.fixture(name="fit")
-def fit_fixture(capsys: pytest.CaptureFixture[str]) -> Fit:
-    return fit_with(capsys)
-
-
-@pytest.fixture(scope="module")
-def sample_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sample(tmp_path_factory.mktemp("once") / "red_paint")
-
-
-@pytest.fixture
-def sample(sample_once: Path, tmp_path: Path) -> Path:
-    """A sample with one scan, to be broken."""
-    return shutil.copytree(sample_once, tmp_path / "red_paint")
-
 
 # -- broken files: one line that names the file, and status 1
 

@@ -8,8 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from tvbrdf_messages.errors import BusError
 from tvbrdf_messages.run_directory import Graph, Participant
@@ -19,6 +18,7 @@ from tvbrdf_nodes.core.node import Node, TopicUse
 from tvbrdf_nodes.core.parameters import ParameterError, build
 
 from .errors import MisuseError, unknown
+from .factory import Factory
 from .inprocess import InProcessRun
 from .plans import plain
 
@@ -30,7 +30,7 @@ Given = Kind | tuple[Kind, Mapping[str, Any]]
 """A node's class or name, alone or with parameters."""
 
 
-class GraphFactory:
+class GraphFactory(Factory):
     """Starts graphs of nodes, and stops them all at its end.
 
     Parameters
@@ -38,21 +38,6 @@ class GraphFactory:
     folder
         For what nodes write; a graph's own directory is elsewhere, with a short path.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._last = contextlib.ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._last.__exit__(kind, error, trace)
 
     def __call__(
         self,

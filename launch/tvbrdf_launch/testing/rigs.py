@@ -8,18 +8,18 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self, overload
+from typing import Any, Literal, overload
 
 from ..launch_file import load_declaration
 from .errors import MisuseError
+from .factory import Factory
 from .inprocess import InProcessRun
 from .plans import check_arguments, find_file, make_run_plan, plain
 from .processes import ProcessRun
 from .scenes import Faults, write_scene
 
 
-class RigFactory:
+class RigFactory(Factory):
     """Starts rigs, and stops them all at its end.
 
     Parameters
@@ -27,21 +27,6 @@ class RigFactory:
     folder
         For databases and scenes, which stay; a run's own directory is elsewhere, with a short path.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._last = contextlib.ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._last.__exit__(kind, error, trace)
 
     @overload
     def __call__(
