@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from tvbrdf_fitting.batch import fit_parameters
 from tvbrdf_fitting.models import COLOURED, SURFACE, get_model
 from tvbrdf_fitting.problem import FitError, Problem, make_problem
 from tvbrdf_fitting.solve import separable
-from tvbrdf_fitting.solve.separable import elementary, equations, search
+from tvbrdf_fitting.solve.separable import elementary, equations, nearby, products, search
 from tvbrdf_fitting.solve.separable.layout import data_of, layout_of
 from tvbrdf_fitting.solve.solvers import SOLVERS
 
@@ -49,15 +48,16 @@ def random_scene(rng: np.random.Generator) -> tuple[list[float], float, int]:
     return [*kd, sigma_d, ks, 1 / sigma_s], noise, int(rng.choice([3, 8, 30]))
 
 
-def searched(problem: Problem) -> tuple[Any, np.ndarray]:
-    """Return what the search makes of a problem: its data and the vectors' products."""
+def searched(problem: Problem) -> products.Scan:
+    """Return what the search makes of a problem."""
     layout = layout_of(problem.model)
     assert layout is not None
     vectors, f, q, radiance, weight = data_of(problem, layout)
-    data = (vectors, f, q, radiance, elementary.squared(weight), np.empty_like(weight))
-    diffuse = np.empty((3, 9))
-    equations.write_diffuse_products(data, diffuse)
-    return data, diffuse
+    scan: products.Scan = products.new_scan(
+        layout.form, vectors, f, q, radiance, elementary.squared(weight)
+    )
+    products.write_diffuse_products(scan)
+    return scan
 
 
 def descended(problem: Problem, starts: np.ndarray) -> float:
@@ -65,15 +65,11 @@ def descended(problem: Problem, starts: np.ndarray) -> float:
     layout = layout_of(problem.model)
     assert layout is not None
     lower, upper = separable.limits(problem, layout)
-    data, diffuse = searched(problem)
-    columns, blocks = np.empty((3, len(data[1]))), equations.nearest(data[2])
-    costs = []
+    scan = searched(problem)
+    columns, costs = np.empty((3, len(scan.f))), []
     for start in starts:
         x = np.clip(start, lower, upper)
-        found = search.descend(
-            x, layout.form, data, blocks, diffuse, lower, upper, columns, 1e-11, 300
-        )
-        costs.append(found[0])
+        costs.append(search.descend(x, scan, lower, upper, columns, 1e-11, 300)[0])
     return float(min(costs))
 
 
@@ -95,15 +91,11 @@ def test_normal_equations_are_those_of_the_model(simulate: Simulate, name: str) 
     x = internal[list(layout.where)]
     size = len(x)
     gradient, matrix, hessian = np.empty(size), np.empty((size, size)), np.empty((size, size))
-    data, diffuse = searched(problem)
-    columns = np.empty((3, len(data[1])))
+    scan = searched(problem)
+    columns = np.empty((3, len(scan.f)))
 
     def equations_at(x: np.ndarray) -> float:
-        return float(
-            equations.normal_equations(
-                x, layout.form, data, diffuse, False, columns, gradient, matrix, hessian
-            )
-        )
+        return float(equations.normal_equations(x, scan, False, columns, gradient, matrix, hessian))
 
     cost = equations_at(x)
     jacobian = problem.jacobian(internal)[:, list(layout.where)]
@@ -112,6 +104,9 @@ def test_normal_equations_are_those_of_the_model(simulate: Simulate, name: str) 
     assert cost == pytest.approx(problem.cost(internal), rel=1e-13)
     np.testing.assert_allclose(gradient, jacobian.T @ residual, rtol=1e-10)
     np.testing.assert_allclose(matrix, jacobian.T @ jacobian, rtol=1e-10, atol=1e-9)
+    alone = np.empty(size)
+    assert equations.cost_and_gradient(x, scan, columns, alone) == pytest.approx(cost, rel=1e-14)
+    np.testing.assert_allclose(alone, gradient, rtol=1e-10)
     # the full second derivatives, by differences of the gradient
     second = hessian.copy()
     for k in range(size):
@@ -123,6 +118,34 @@ def test_normal_equations_are_those_of_the_model(simulate: Simulate, name: str) 
             sides.append(gradient.copy())
         slope = (sides[0] - sides[1]) / (2 * step)
         np.testing.assert_allclose(second[:, k], slope, rtol=1e-5, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", [SURFACE, COLOURED])
+@pytest.mark.parametrize("u", [-0.3, 0.9, 2.0, 3.8])
+def test_polynomials_give_the_normal_equations(simulate: Simulate, name: str, u: float) -> None:
+    model = get_model(name)
+    problem = make_problem(simulate(model.typical, name, noise=0.02, step=3), model, {}, {})
+    layout, scan = layout_of(model), searched(problem)
+    assert layout is not None
+    x = model.to_internal(model.typical * 1.1)[list(layout.where)]
+    x[-1], size = u, len(x)
+    exact = np.empty(size), np.empty((size, size)), np.empty((size, size))
+    equations.normal_equations(x, scan, False, np.empty((3, len(scan.f))), *exact)
+    us = np.array([u - 0.17, u + 0.2])  # the nearest width is as far as it can be
+    near, data = nearby.new_nearby(len(us), len(scan.f)), np.empty((3, 10))
+    nearby._write_data(near, 0, us[0], scan, data)
+    lobe, slope, bend = np.empty((3, 5)), np.empty((3, 5)), np.empty((3, 5))
+    nearby._write_products((u - us[0]) / nearby._REACH, near.own[0], data, lobe, slope, bend)
+    found = np.empty(size), np.empty((size, size)), np.empty((size, size))
+    nearby._write_equations(x, scan, lobe, slope, bend, np.empty(16), *found)
+    scale = np.sqrt(np.diag(exact[1]))
+    # errors beside what the data weigh: the polynomials' own, 1e-9 and more for each derivative
+    whole = np.sqrt((scan.squares * scan.radiance**2).sum())
+    np.testing.assert_allclose(found[0] / scale, exact[0] / scale, atol=1e-8 * whole)
+    for ours, theirs in zip(found[1:], exact[1:], strict=True):
+        np.testing.assert_allclose(
+            ours / np.outer(scale, scale), theirs / np.outer(scale, scale), atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("name", FITTED)
@@ -219,6 +242,29 @@ class TestBatch:
         found = SOLVERS["separable"](single).internal
         np.testing.assert_allclose(alike.values[7], model.to_published(found), rtol=1e-9)
         assert alike.chi_square[7] == pytest.approx(2 * single.cost(found), rel=1e-9)
+
+    @pytest.mark.parametrize("name", [SURFACE, COLOURED])
+    def test_is_as_low_as_single_fits_everywhere(self, simulate: Simulate, name: str) -> None:
+        """Scenes with vanishing, hidden and needle lobes that share directions and weights."""
+        model, rng = get_model(name), np.random.default_rng(3)
+        coloured = len(model.parameters) - 6
+        observations = simulate(model.typical, name, noise=0.01, step=9)
+        light, view = observations.light_direction, observations.view_direction
+        noise = np.sqrt(observations.variance)
+        scans = []
+        for _ in range(150):
+            truth, _, _ = random_scene(rng)
+            truth[4:5] = truth[4] * np.exp(rng.uniform(-1, 1, coloured + 1))
+            value = np.pi * model.evaluate(light, view, truth) * light[:, 2:]
+            scans.append(value + noise * rng.normal(size=value.shape))
+        variance = np.where(observations.valid, observations.variance, np.inf)
+        batch = fit_parameters(light, view, np.array(scans), variance, name)
+        for k, values in enumerate(scans):
+            single = make_problem(replace(observations, radiance=values), model, {}, {})
+            cost = single.cost(separable.solve(single).internal)
+            assert batch.chi_square[k] == pytest.approx(2 * cost, rel=1e-9)
+            reached = single.cost(model.to_internal(batch.values[k]))
+            assert reached == pytest.approx(cost, rel=1e-9)
 
     def test_other_models_go_the_long_way(self, simulate: Simulate) -> None:
         name = "lambert+phong"

@@ -1,7 +1,9 @@
 """The separable solver: compiled, and certain of the global optimum.
 
 `layout` says which models it can fit, `search` finds every valley over the lobe's width and
-descends each, `amplitudes`, `equations` and `elementary` are what it is made of.
+descends each, `many` does so for scans that share their directions, `nearby` with next to no sums
+where they share their weights too. `products`, `equations`, `amplitudes`, `widths` and `elementary`
+are what they are made of.
 """
 
 from __future__ import annotations

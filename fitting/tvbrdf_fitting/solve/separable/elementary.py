@@ -69,6 +69,15 @@ def squared(values):
 
 
 @njit(**JIT)
+def write_scale(x, matrix, gradient, lower, upper, scale, free):
+    """Write each coordinate's scale, and whether a step may change it."""
+    for i in range(x.shape[0]):
+        scale[i] = math.sqrt(matrix[i, i]) if matrix[i, i] > 0 else 1.0
+        outward = (x[i] <= lower[i] and gradient[i] >= 0) or (x[i] >= upper[i] and gradient[i] <= 0)
+        free[i] = matrix[i, i] > 0 and not outward and lower[i] < upper[i]
+
+
+@njit(**JIT)
 def solve_damped(matrix, gradient, scale, free, damping, factor, step):
     """Solve (D H D + damping) D^-1 step = -D gradient, D = 1 / scale, for the free coordinates.
 

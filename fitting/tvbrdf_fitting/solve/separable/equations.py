@@ -1,7 +1,7 @@
-"""Compiled sums over the observations: residuals, normal equations, products with a lobe.
+"""Compiled: the cost of a point, its gradient and its second derivatives, of true residuals.
 
-`data` are the vectors of one scan: vectors (3, n), f (n,), q (n,), radiance (3, n), squares (3, n)
-of the weights, weighted (3, n) radiance times squares. Rows without weight have 0 in `squares`.
+What a channel's 16 sums make of gradient and matrices is apart from how they come about: `nearby`
+has them from products.
 """
 
 from __future__ import annotations
@@ -11,11 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
-from .elementary import JIT, SUMS, exp_negative
-
-BLOCK = 32
-_OUT = 40.0
-"""Exponent beyond which a lobe is 0 to all digits beside its peak: exp(-40) = 4e-18."""
+from .elementary import JIT, SUMS
+from .products import write_exponentials
 
 
 @njit(**JIT)
@@ -33,204 +30,13 @@ def diffuse_coefficients(s, form):
 
 
 @njit(**JIT)
-def nearest(q):
-    """Return the smallest q of each block of `BLOCK` rows."""
-    blocks = np.empty((q.shape[0] + BLOCK - 1) // BLOCK)
-    for k in range(blocks.shape[0]):
-        lowest = np.inf
-        for i in range(k * BLOCK, min((k + 1) * BLOCK, q.shape[0])):
-            lowest = min(lowest, q[i])
-        blocks[k] = lowest
-    return blocks
-
-
-@njit(fastmath=SUMS, **JIT)
-def _add_diffuse_products(squares, x0, x1, x2, radiance, weighted, products):
-    energy = p0 = p1 = p2 = p3 = p4 = p5 = p6 = p7 = p8 = 0.0
-    for i in range(radiance.shape[0]):
-        w = squares[i]
-        a, b, c, y = x0[i], x1[i], x2[i], w * radiance[i]
-        weighted[i] = y
-        p0 += w * a * a
-        p1 += w * a * b
-        p2 += w * a * c
-        p3 += w * b * b
-        p4 += w * b * c
-        p5 += w * c * c
-        p6 += a * y
-        p7 += b * y
-        p8 += c * y
-        energy += y * radiance[i]
-    products[0], products[1], products[2], products[3], products[4] = p0, p1, p2, p3, p4
-    products[5], products[6], products[7], products[8] = p5, p6, p7, p8
-    return energy
-
-
-@njit(**JIT)
-def write_diffuse_products(data, diffuse):
-    """Write each channel's products 00, 01, 02, 11, 12, 22 of the vectors, and with the data 0-2.
-
-    Also write the weighted data; return the data's product with themselves, of all channels.
-    """
-    vectors, _, _, radiance, squares, weighted = data
-    energy = 0.0
-    for c in range(3):
-        energy += _add_diffuse_products(
-            squares[c], vectors[0], vectors[1], vectors[2], radiance[c], weighted[c], diffuse[c]
-        )
-    return energy
-
-
-@njit(fastmath=SUMS, **JIT)
-def _add_diffuse_data(squares, x0, x1, x2, radiance, weighted, products):
-    energy = p0 = p1 = p2 = 0.0
-    for i in range(radiance.shape[0]):
-        y = squares[i] * radiance[i]
-        weighted[i] = y
-        p0 += x0[i] * y
-        p1 += x1[i] * y
-        p2 += x2[i] * y
-        energy += y * radiance[i]
-    products[6], products[7], products[8] = p0, p1, p2
-    return energy
-
-
-@njit(**JIT)
-def write_diffuse_data(data, diffuse):
-    """Do what `write_diffuse_products` does where the vectors' own products are written already."""
-    vectors, _, _, radiance, squares, weighted = data
-    energy = 0.0
-    for c in range(3):
-        energy += _add_diffuse_data(
-            squares[c], vectors[0], vectors[1], vectors[2], radiance[c], weighted[c], diffuse[c]
-        )
-    return energy
-
-
-@njit(fastmath=SUMS, **JIT)
-def _write_exponentials(q, scale, out):
-    for i in range(q.shape[0]):
-        out[i] = exp_negative(q[i] * scale)
-
-
-@njit(fastmath=SUMS, **JIT)
-def _square(values):
-    for i in range(values.shape[0]):
-        # no denormals, which are slow
-        values[i] = values[i] * values[i] if values[i] > 1e-140 else 0.0
-
-
-@njit(fastmath=SUMS, **JIT)
-def _add_lobe_products(f, falloff, x0, x1, x2, s0, s1, s2, y0, y1, y2, products):
-    a0 = a1 = a2 = a3 = a4 = 0.0
-    b0 = b1 = b2 = b3 = b4 = 0.0
-    c0 = c1 = c2 = c3 = c4 = 0.0
-    for i in range(f.shape[0]):
-        lobe = f[i] * falloff[i]
-        u, v, w, square = lobe * x0[i], lobe * x1[i], lobe * x2[i], lobe * lobe
-        a0 += s0[i] * u
-        a1 += s0[i] * v
-        a2 += s0[i] * w
-        a3 += s0[i] * square
-        a4 += y0[i] * lobe
-        b0 += s1[i] * u
-        b1 += s1[i] * v
-        b2 += s1[i] * w
-        b3 += s1[i] * square
-        b4 += y1[i] * lobe
-        c0 += s2[i] * u
-        c1 += s2[i] * v
-        c2 += s2[i] * w
-        c3 += s2[i] * square
-        c4 += y2[i] * lobe
-    for k, (a, b, c) in enumerate(
-        ((a0, b0, c0), (a1, b1, c1), (a2, b2, c2), (a3, b3, c3), (a4, b4, c4))
-    ):
-        products[0, k] += a
-        products[1, k] += b
-        products[2, k] += c
-
-
-@njit(**JIT)
-def write_lobe_products(scale, power, data, blocks, falloff, products):
-    """Write the weighted lobe's products with the vectors (3), itself and the data: (3, 5).
-
-    The lobe is f times exp(-q scale), the falloff. With `power` 1 it is computed, with 2 it is the
-    square of what `falloff` (n,) holds, that of half the scale. Blocks of rows in which a narrow
-    lobe is 0 to all digits are left out; there the falloff gets 0.
-    """
-    vectors, f, q, _, squares, weighted = data
-    products[:, :] = 0.0
-    k = 0
-    while k < blocks.shape[0]:
-        first = k
-        while k < blocks.shape[0] and blocks[k] * scale < _OUT:
-            k += 1
-        if k > first:
-            a, z = first * BLOCK, min(k * BLOCK, f.shape[0])
-            part = falloff[a:z]
-            if power == 2:
-                _square(part)
-            else:
-                _write_exponentials(q[a:z], scale, part)
-            # one-dimensional slices are known to be contiguous, so the sums vectorise
-            _add_lobe_products(
-                f[a:z],
-                part,
-                vectors[0, a:z],
-                vectors[1, a:z],
-                vectors[2, a:z],
-                squares[0, a:z],
-                squares[1, a:z],
-                squares[2, a:z],
-                weighted[0, a:z],
-                weighted[1, a:z],
-                weighted[2, a:z],
-                products,
-            )
-        if k < blocks.shape[0]:
-            falloff[k * BLOCK : min((k + 1) * BLOCK, f.shape[0])] = 0.0
-        k += 1
-
-
-@njit(fastmath=SUMS, **JIT)
-def _add_data_products(one, other, y0, y1, y2, first, second):
-    a = b = c = d = e = f = 0.0
-    for i in range(one.shape[0]):
-        a += y0[i] * one[i]
-        b += y1[i] * one[i]
-        c += y2[i] * one[i]
-        d += y0[i] * other[i]
-        e += y1[i] * other[i]
-        f += y2[i] * other[i]
-    first[0, 4] += a
-    first[1, 4] += b
-    first[2, 4] += c
-    second[0, 4] += d
-    second[1, 4] += e
-    second[2, 4] += f
-
-
-@njit(**JIT)
-def write_data_products(scales, table, blocks, weighted, lobes):
-    """Write only the products with the data, of lobes (w, n) whose scales ascend, into (w, 3, 5).
-
-    Two at a time: reading the data takes longer than multiplying them.
-    """
-    lobes[:, :, 4] = 0.0
-    for m in range(0, scales.shape[0], 2):
-        other = min(m + 1, scales.shape[0] - 1)
-        spare = lobes[other] if other > m else np.empty((3, 5))
-        k = 0
-        while k < blocks.shape[0]:
-            first = k
-            while k < blocks.shape[0] and blocks[k] * scales[m] < _OUT:
-                k += 1
-            if k > first:
-                a, z = first * BLOCK, min(k * BLOCK, table.shape[1])
-                y0, y1, y2 = weighted[0, a:z], weighted[1, a:z], weighted[2, a:z]
-                _add_data_products(table[m, a:z], table[other, a:z], y0, y1, y2, lobes[m], spare)
-            k += 1
+def diffuse_bends(s, form, coefficients):
+    """Return second derivatives of C1, B, E, each of which is a quotient with s + constant."""
+    return (
+        -2 * coefficients[3] / (s + form[0]),
+        -2 * coefficients[4] / (s + 0.09),
+        -2 * coefficients[5] / (s + 0.13),
+    )
 
 
 @njit(fastmath=SUMS, **JIT)
@@ -275,6 +81,32 @@ def _write_sums(a0, a1, a2, ks, radiance, squares, x0, x1, x2, lobe, slope, bend
     sums[10], sums[11], sums[12], sums[13], sums[14], sums[15] = o10, o11, o12, o13, o14, o15
 
 
+@njit(fastmath=SUMS, **JIT)
+def _write_slope(f, q, scale, lobe, slope):
+    """Turn the falloff into the lobe and write its slope by u."""
+    for i in range(q.shape[0]):
+        value = f[i] * lobe[i]
+        lobe[i] = value
+        slope[i] = -2.0 * min(q[i] * scale, 1e3) * value
+
+
+@njit(fastmath=SUMS, **JIT)
+def _write_residual_sums(a0, a1, a2, ks, radiance, squares, x0, x1, x2, lobe, slope, sums):
+    """Write the sums of r with r, the vectors, the lobe and its slope: the first six of all."""
+    o0 = o1 = o2 = o3 = o4 = o5 = 0.0
+    for i in range(radiance.shape[0]):
+        one, two, three, p = x0[i], x1[i], x2[i], lobe[i]
+        r = (a0 * one + a1 * two + a2 * three + ks * p) - radiance[i]
+        wr = squares[i] * r
+        o0 += wr * r
+        o1 += wr * one
+        o2 += wr * two
+        o3 += wr * three
+        o4 += wr * p
+        o5 += wr * slope[i]
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = o0, o1, o2, o3, o4, o5
+
+
 @njit(**JIT)
 def _inner(a, b, g):
     """Return the product of two combinations of the vectors, whose own are g: 00 01 02 11 12 22."""
@@ -286,72 +118,124 @@ def _inner(a, b, g):
 
 
 @njit(**JIT)
-def normal_equations(x, form, data, diffuse, known, columns, gradient, matrix, hessian):
+def add_gradient(x, c, coefficients, sums, gradient):
+    """Add a channel's part to the gradient; return its half of squares."""
+    c1, b, e, slope_c1, slope_b, slope_e = coefficients
+    last = x.shape[0] - 1
+    k = 4 + c if last == 7 else 4
+    kd = x[c]
+    gradient[c] += c1 * sums[1] + b * sums[2] + 2 * kd * e * sums[3]
+    gradient[3] += kd * (slope_c1 * sums[1] + slope_b * sums[2] + kd * slope_e * sums[3])
+    gradient[k] += sums[4]
+    gradient[last] += x[k] * sums[5]
+    return 0.5 * sums[0]
+
+
+@njit(**JIT)
+def add_curvature(x, c, diffuse, coefficients, bends, sums, matrix, hessian):
+    """Add a channel's part to the lower triangles."""
+    c1, b, e, slope_c1, slope_b, slope_e = coefficients
+    last = x.shape[0] - 1
+    k = 4 + c if last == 7 else 4
+    kd, ks, own = x[c], x[k], diffuse[c]
+    by_kd = (c1, b, 2 * kd * e)
+    by_s = (kd * slope_c1, kd * slope_b, kd * kd * slope_e)
+    matrix[c, c] += _inner(by_kd, by_kd, own)
+    matrix[3, c] += _inner(by_kd, by_s, own)
+    matrix[3, 3] += _inner(by_s, by_s, own)
+    matrix[k, c] += by_kd[0] * sums[7] + by_kd[1] * sums[8] + by_kd[2] * sums[9]
+    matrix[k, 3] += by_s[0] * sums[7] + by_s[1] * sums[8] + by_s[2] * sums[9]
+    matrix[k, k] += sums[10]
+    matrix[last, c] += ks * (by_kd[0] * sums[11] + by_kd[1] * sums[12] + by_kd[2] * sums[13])
+    matrix[last, 3] += ks * (by_s[0] * sums[11] + by_s[1] * sums[12] + by_s[2] * sums[13])
+    matrix[last, k] += ks * sums[14]
+    matrix[last, last] += ks * ks * sums[15]
+    hessian[c, c] += 2 * e * sums[3]
+    hessian[3, c] += slope_c1 * sums[1] + slope_b * sums[2] + 2 * kd * slope_e * sums[3]
+    hessian[3, 3] += kd * (bends[0] * sums[1] + bends[1] * sums[2] + kd * bends[2] * sums[3])
+    hessian[last, k] += sums[5]
+    hessian[last, last] += ks * sums[6]
+
+
+@njit(**JIT)
+def mirror(matrix, hessian):
+    """Write the upper triangles; add the matrix of first derivatives to that of the second."""
+    for i in range(matrix.shape[0]):
+        for j in range(i + 1):
+            matrix[j, i] = matrix[i, j]
+            hessian[i, j] += matrix[i, j]
+            hessian[j, i] = hessian[i, j]
+
+
+@njit(**JIT)
+def normal_equations(x, scan, known, columns, gradient, matrix, hessian):
     """Return half the sum of squares at x; write its gradient and its second derivatives.
 
     `matrix` gets those of Gauss and Newton, from first derivatives alone, `hessian` the true ones:
     without what the residuals add, steps creep where a lobe is as weak as the noise. Cost and
     gradient are sums of true residuals; the matrices, which only aim steps, use the vectors'
-    products `diffuse`. `columns` (3, n) is overwritten; its first row has the falloff if `known`.
+    products. `columns` (3, n) is overwritten; its first row has the falloff if `known`.
     """
-    vectors, f, q, radiance, squares, _ = data
     last = x.shape[0] - 1
-    s = x[3]
-    c1, b, e, slope_c1, slope_b, slope_e = diffuse_coefficients(s, form)
-    # second derivatives of the coefficients, each a quotient with s + constant
-    bend_c1 = -2 * slope_c1 / (s + form[0])
-    bend_b, bend_e = -2 * slope_b / (s + 0.09), -2 * slope_e / (s + 0.13)
+    coefficients = diffuse_coefficients(x[3], scan.form)
+    bends = diffuse_bends(x[3], scan.form, coefficients)
+    c1, b, e = coefficients[0], coefficients[1], coefficients[2]
     scale = math.exp(2 * x[last])
     if not known:
-        _write_exponentials(q, scale, columns[0])
-    _write_columns(f, q, scale, columns[0], columns[1], columns[2])
+        write_exponentials(scan.q, scale, columns[0])
+    _write_columns(scan.f, scan.q, scale, columns[0], columns[1], columns[2])
     gradient[:] = 0.0
     matrix[:, :] = 0.0
     hessian[:, :] = 0.0
     cost, sums = 0.0, np.empty(16)
     for c in range(3):
-        k = 4 + c if last == 7 else 4
-        kd, ks, own = x[c], x[k], diffuse[c]
+        kd = x[c]
         _write_sums(
             kd * c1,
             kd * b,
             kd * kd * e,
-            ks,
-            radiance[c],
-            squares[c],
-            vectors[0],
-            vectors[1],
-            vectors[2],
+            x[4 + c] if last == 7 else x[4],
+            scan.radiance[c],
+            scan.squares[c],
+            scan.vectors[0],
+            scan.vectors[1],
+            scan.vectors[2],
             columns[0],
             columns[1],
             columns[2],
             sums,
         )
-        by_kd = (c1, b, 2 * kd * e)
-        by_s = (kd * slope_c1, kd * slope_b, kd * kd * slope_e)
-        cost += 0.5 * sums[0]
-        gradient[c] += by_kd[0] * sums[1] + by_kd[1] * sums[2] + by_kd[2] * sums[3]
-        gradient[3] += by_s[0] * sums[1] + by_s[1] * sums[2] + by_s[2] * sums[3]
-        gradient[k] += sums[4]
-        gradient[last] += ks * sums[5]
-        matrix[c, c] += _inner(by_kd, by_kd, own)
-        matrix[3, c] += _inner(by_kd, by_s, own)
-        matrix[3, 3] += _inner(by_s, by_s, own)
-        matrix[k, c] += by_kd[0] * sums[7] + by_kd[1] * sums[8] + by_kd[2] * sums[9]
-        matrix[k, 3] += by_s[0] * sums[7] + by_s[1] * sums[8] + by_s[2] * sums[9]
-        matrix[k, k] += sums[10]
-        matrix[last, c] += ks * (by_kd[0] * sums[11] + by_kd[1] * sums[12] + by_kd[2] * sums[13])
-        matrix[last, 3] += ks * (by_s[0] * sums[11] + by_s[1] * sums[12] + by_s[2] * sums[13])
-        matrix[last, k] += ks * sums[14]
-        matrix[last, last] += ks * ks * sums[15]
-        hessian[c, c] += 2 * e * sums[3]
-        hessian[3, c] += slope_c1 * sums[1] + slope_b * sums[2] + 2 * kd * slope_e * sums[3]
-        hessian[3, 3] += kd * (bend_c1 * sums[1] + bend_b * sums[2] + kd * bend_e * sums[3])
-        hessian[last, k] += sums[5]
-        hessian[last, last] += ks * sums[6]
-    for i in range(last + 1):
-        for j in range(i + 1):
-            matrix[j, i] = matrix[i, j]
-            hessian[i, j] += matrix[i, j]
-            hessian[j, i] = hessian[i, j]
+        cost += add_gradient(x, c, coefficients, sums, gradient)
+        add_curvature(x, c, scan.diffuse, coefficients, bends, sums, matrix, hessian)
+    mirror(matrix, hessian)
+    return cost
+
+
+@njit(**JIT)
+def cost_and_gradient(x, scan, columns, gradient):
+    """Return what `normal_equations` does, of true residuals; write only the gradient."""
+    last = x.shape[0] - 1
+    coefficients = diffuse_coefficients(x[3], scan.form)
+    scale = math.exp(2 * x[last])
+    write_exponentials(scan.q, scale, columns[0])
+    _write_slope(scan.f, scan.q, scale, columns[0], columns[1])
+    gradient[:] = 0.0
+    cost, sums = 0.0, np.empty(6)
+    for c in range(3):
+        kd = x[c]
+        _write_residual_sums(
+            kd * coefficients[0],
+            kd * coefficients[1],
+            kd * kd * coefficients[2],
+            x[4 + c] if last == 7 else x[4],
+            scan.radiance[c],
+            scan.squares[c],
+            scan.vectors[0],
+            scan.vectors[1],
+            scan.vectors[2],
+            columns[0],
+            columns[1],
+            sums,
+        )
+        cost += add_gradient(x, c, coefficients, sums, gradient)
     return cost

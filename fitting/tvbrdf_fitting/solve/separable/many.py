@@ -7,15 +7,16 @@ from numba import njit
 
 from .amplitudes import reduced_lobes
 from .elementary import JIT, SUMS
-from .equations import (
-    nearest,
+from .nearby import new_nearby
+from .products import (
+    new_scan,
     write_data_products,
     write_diffuse_data,
     write_diffuse_products,
     write_lobe_products,
 )
 from .search import search, solve_weighted
-from .widths import nearest_seen, seen_amplitudes, shifted, widths_between
+from .widths import Sweep, nearest_seen, seen_amplitudes, shifted, widths_between
 
 
 @njit(**JIT)
@@ -69,16 +70,14 @@ def solve_each(
     xs, form, geometry, radiances, variances, rows, lower, upper, tolerance, costs, counts
 ):
     """Solve scans (m, n, 3) with variances of their own; see `solve_alike`."""
-    vectors, f, q = geometry
-    radiance, squares = np.empty((3, f.shape[0])), np.empty((3, f.shape[0]))
-    data = (vectors, f, q, radiance, squares, np.empty((3, f.shape[0])))
+    radiance, squares = np.empty((3, rows.shape[0])), np.empty((3, rows.shape[0]))
     for m in range(xs.shape[0]):
         if not _take_squares(variances[m], rows, squares):
             return m
         if not _take_radiance(radiances[m], rows, squares, radiance):
             return m
         costs[m], counts[m, 0], counts[m, 1], counts[m, 2] = solve_weighted(
-            xs[m], form, data, lower, upper, tolerance
+            xs[m], form, geometry, radiance, squares, lower, upper, tolerance
         )
     return -1
 
@@ -95,40 +94,28 @@ def solve_alike(
     """
     vectors, f, q = geometry
     n = f.shape[0]
-    radiance, squares, weighted = np.zeros((3, n)), np.empty((3, n)), np.empty((3, n))
+    radiance, squares, columns = np.zeros((3, n)), np.empty((3, n)), np.empty((3, n))
     if not _take_squares(variance, rows, squares):
         return 0
     nearer, high = nearest_seen(q, squares, lower, upper)
-    data = (vectors, f, shifted(q, nearer), radiance, squares, weighted)
-    blocks, us = nearest(data[2]), widths_between(lower, high)
-    diffuse, columns = np.empty((3, 9)), np.empty((3, n))
+    scan = new_scan(form, vectors, f, shifted(q, nearer), radiance, squares)
+    us = widths_between(lower, high)
     lobes, table = np.empty((us.shape[0], 3, 5)), np.empty((us.shape[0], n))
-    write_diffuse_products(data, diffuse)
+    write_diffuse_products(scan)
     scales = np.exp(2 * us)
     for k in range(us.shape[0]):
-        write_lobe_products(scales[k], 1, data, blocks, table[k], lobes[k])
+        write_lobe_products(scales[k], 1, scan, table[k], lobes[k])
         for i in range(n):
             table[k, i] *= f[i]
-    reduced = reduced_lobes(diffuse, lobes)
+    sweep = Sweep(us, lobes, reduced_lobes(scan.diffuse, lobes))
+    near = new_nearby(us.shape[0], n)
     for m in range(xs.shape[0]):
         if not _take_radiance(radiances[m], rows, squares, radiance):
             return m
-        energy = write_diffuse_data(data, diffuse)
-        write_data_products(scales, table, blocks, weighted, lobes)
+        energy = write_diffuse_data(scan)
+        write_data_products(scales, table, scan.nearest, scan.weighted, lobes)
         costs[m], counts[m, 0], counts[m, 1], counts[m, 2] = search(
-            xs[m],
-            form,
-            data,
-            blocks,
-            diffuse,
-            us,
-            lobes,
-            reduced,
-            energy,
-            lower,
-            high,
-            columns,
-            tolerance,
+            xs[m], scan, sweep, near, energy, lower, high, columns, tolerance
         )
         seen_amplitudes(xs[m], nearer)
     return -1

@@ -33,9 +33,12 @@ from .amplitudes import (
     settle,
     triangulate,
 )
-from .elementary import JIT, bounded_step, clip, squared
-from .equations import nearest, normal_equations, write_diffuse_products, write_lobe_products
+from .elementary import JIT, bounded_step, clip, squared, write_scale
+from .equations import normal_equations
+from .nearby import approach
+from .products import new_scan, write_diffuse_products, write_lobe_products
 from .widths import (
+    Sweep,
     nearest_seen,
     seen_amplitudes,
     shifted,
@@ -61,12 +64,13 @@ _SAME = 0.1
 
 
 @njit(**JIT)
-def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, steps):
+def descend(x, scan, lower, upper, columns, tolerance, steps):
     """Newton steps, damped, from x, in place, within bounds; return (cost, evaluations, status).
 
     Where the second derivatives are not positive, the Gauss-Newton matrix stands in for them.
     `columns` (3, n) is overwritten.
     """
+    form, diffuse = scan.form, scan.diffuse
     size = x.shape[0]
     gradient, trial_gradient, step = np.empty(size), np.empty(size), np.empty(size)
     trial, scale, work = np.empty(size), np.empty(size), np.empty((2, size))
@@ -74,16 +78,11 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
     curvature, trial_curvature = np.empty((size, size)), np.empty((size, size))
     factor, products, forms = np.empty((size, size)), np.empty((3, 5)), np.empty((3, 9))
     free, held = np.ones(size, np.bool_), np.ones(size, np.bool_)
-    cost = normal_equations(x, form, data, diffuse, False, columns, gradient, matrix, curvature)
+    cost = normal_equations(x, scan, False, columns, gradient, matrix, curvature)
     evaluations, damping, growth, previous, rate = 1, 0.0, 2.0, np.inf, 1.0
     faithful = False
     for _ in range(steps):
-        for i in range(size):
-            scale[i] = math.sqrt(matrix[i, i]) if matrix[i, i] > 0 else 1.0
-            outward = (x[i] <= lower[i] and gradient[i] >= 0) or (
-                x[i] >= upper[i] and gradient[i] <= 0
-            )
-            free[i] = matrix[i, i] > 0 and not outward and lower[i] < upper[i]
+        write_scale(x, matrix, gradient, lower, upper, scale, free)
         model = curvature
         held[:] = free
         if not bounded_step(
@@ -118,21 +117,13 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
         known = length > _BEND * extent
         if known:
             scale_u = math.exp(2 * trial[size - 1])
-            write_lobe_products(scale_u, 1, data, blocks, columns[0], products)
+            write_lobe_products(scale_u, 1, scan, columns[0], products)
             if length > _FAR * extent:
                 settle(trial, step[3], form, diffuse, products, lower, upper, forms)
             else:
                 improve_amplitudes(trial, form, diffuse, products, lower, upper, WARM_ROUNDS, forms)
         trial_cost = normal_equations(
-            trial,
-            form,
-            data,
-            diffuse,
-            known,
-            columns,
-            trial_gradient,
-            trial_matrix,
-            trial_curvature,
+            trial, scan, known, columns, trial_gradient, trial_matrix, trial_curvature
         )
         evaluations += 1
         reduction = cost - trial_cost
@@ -167,15 +158,14 @@ def descend(x, form, data, blocks, diffuse, lower, upper, columns, tolerance, st
 
 
 @njit(**JIT)
-def find_bottoms(
-    best, form, data, blocks, diffuse, triangles, us, floors, lobes, energy, lower, upper, falloff
-):
+def find_bottoms(best, scan, sweep, triangles, floors, energy, lower, upper, falloff):
     """Return the best points (k, 6) or (k, 8) at suspicious widths, in order, and their costs (k,).
 
     Only widths whose bound lies below what was found can hide a deeper valley. Where such a width's
     own cost is far above it, a valley can be narrower than the grid: it is looked for in between.
     Costs of what is no local minimum are inf.
     """
+    us, form, diffuse = sweep.us, scan.form, scan.diffuse
     size, widths = lower.shape[0], us.shape[0]
     count = (widths - 1) * _CLOSER + 1
     costs, bottoms, points = np.full(count, np.inf), np.full(count, np.inf), np.empty((count, size))
@@ -187,14 +177,14 @@ def find_bottoms(
             node, u = k // _CLOSER, us[k // _CLOSER]
             if turn == 0:
                 suspicious = floors[node] < best + margin
-                products[:, :] = lobes[node]
+                products[:, :] = sweep.lobes[node]
             else:
                 suspicious = floors[node] < best + margin or floors[node + 1] < best + margin
                 ends = costs[node * _CLOSER], costs[(node + 1) * _CLOSER]
                 if not suspicious or max(ends[0], ends[1]) < _NEARLY * best:
                     continue
                 u += (us[node + 1] - u) * turn / _CLOSER
-                write_lobe_products(math.exp(2 * u), 1, data, blocks, falloff, products)
+                write_lobe_products(math.exp(2 * u), 1, scan, falloff, products)
                 reduce_lobe(triangles, products, reduced)
                 floor = 0.5 * energy + lower_bound(triangles, products, reduced, coloured)
                 suspicious = floor < best + margin
@@ -221,40 +211,31 @@ def find_bottoms(
 
 
 @njit(**JIT)
-def search(
-    x, form, data, blocks, diffuse, us, lobes, reduced, energy, lower, upper, columns, tolerance
-):
-    """Descend every valley that could hold the optimum, given all products; see `solve`."""
-    size, widths = x.shape[0], us.shape[0]
+def search(x, scan, sweep, near, energy, lower, upper, columns, tolerance):
+    """Descend every valley that could hold the optimum, given all products; see `solve`.
+
+    `near` tells the products between the widths that were tried, or is None.
+    """
+    us, size = sweep.us, x.shape[0]
     triangles, products, room = np.empty((3, 9)), np.empty((3, 5)), np.empty((6, 9))
-    floors, start, falloff = np.empty(widths), np.empty(size), columns[0]
-    triangulate(diffuse, triangles)
-    for k in range(widths):
-        floors[k] = 0.5 * energy + lower_bound(triangles, lobes[k], reduced[k], size == 8)
+    floors, start, falloff = np.empty(us.shape[0]), np.empty(size), columns[0]
+    triangulate(scan.diffuse, triangles)
+    for k in range(us.shape[0]):
+        bound = lower_bound(triangles, sweep.lobes[k], sweep.reduced[k], size == 8)
+        floors[k] = 0.5 * energy + bound
     for i in range(size):
         x[i] = clip(0.0, lower[i], upper[i])
     x[size - 1] = began = width_between(us, floors, int(np.argmin(floors)))
-    write_lobe_products(math.exp(2 * began), 1, data, blocks, falloff, products)
-    _, elsewhere = best_at_width(x, form, diffuse, products, lower, upper, ROUGH, room)
-    best, evaluations, status = descend(
-        x, form, data, blocks, diffuse, lower, upper, columns, tolerance, MAX_STEPS
-    )
-    valleys = 1
+    best, evaluations, status, valleys = np.inf, 1, CONVERGED, 1
+    if near is None:
+        elsewhere = _begin(x, scan, lower, upper, ROUGH, falloff, products, room)
+    else:
+        best, elsewhere = approach(x, scan, us, near, lower, upper, columns, room)
+    if best == np.inf:
+        best, evaluations, status = descend(x, scan, lower, upper, columns, tolerance, MAX_STEPS)
     if np.min(floors) < best * (1 + 1e-9) + 1e-10 * energy:
         points, bottoms = find_bottoms(
-            best,
-            form,
-            data,
-            blocks,
-            diffuse,
-            triangles,
-            us,
-            floors,
-            lobes,
-            energy,
-            lower,
-            upper,
-            falloff,
+            best, scan, sweep, triangles, floors, energy, lower, upper, falloff
         )
         at = x[size - 1]
         for _ in range(VALLEYS - 1):
@@ -269,7 +250,7 @@ def search(
             start[:] = points[chosen]
             # a valley is nearly as deep at its best grid point as at its bottom
             cost, spent, state = descend(
-                start, form, data, blocks, diffuse, lower, upper, columns, tolerance, SECOND_STEPS
+                start, scan, lower, upper, columns, tolerance, SECOND_STEPS
             )
             valleys += 1
             evaluations += spent
@@ -283,17 +264,16 @@ def search(
         return best, evaluations, status, valleys
     # dark surfaces can have two valleys of s at one width
     start[:] = x
-    write_lobe_products(math.exp(2 * x[size - 1]), 1, data, blocks, falloff, products)
-    _, elsewhere = best_at_width(start, form, diffuse, products, lower, upper, EXACT, room)
+    elsewhere = _begin(start, scan, lower, upper, EXACT, falloff, products, room)
     other = abs(start[3] - x[3]) > _APART * (0.1 + x[3])
     if not other and elsewhere >= 0:
         other = True
         start[3] = elsewhere
-        improve_amplitudes(start, form, diffuse, products, lower, upper, COLD_ROUNDS, room[:3])
-    if other:
-        cost, spent, state = descend(
-            start, form, data, blocks, diffuse, lower, upper, columns, tolerance, SECOND_STEPS
+        improve_amplitudes(
+            start, scan.form, scan.diffuse, products, lower, upper, COLD_ROUNDS, room[:3]
         )
+    if other:
+        cost, spent, state = descend(start, scan, lower, upper, columns, tolerance, SECOND_STEPS)
         valleys += 1
         evaluations += spent
         if cost < best:
@@ -303,7 +283,17 @@ def search(
 
 
 @njit(**JIT)
-def solve(x, form, scan, lower, upper, tolerance):
+def _begin(x, scan, lower, upper, refinements, falloff, products, room):
+    """Make s and the amplitudes the best at the width of x; return another valley's s, or -1."""
+    write_lobe_products(math.exp(2 * x[x.shape[0] - 1]), 1, scan, falloff, products)
+    _, elsewhere = best_at_width(
+        x, scan.form, scan.diffuse, products, lower, upper, refinements, room
+    )
+    return elsewhere
+
+
+@njit(**JIT)
+def solve(x, form, data, lower, upper, tolerance):
     """Find the global optimum within the bounds and write it into x.
 
     Parameters
@@ -312,7 +302,7 @@ def solve(x, form, scan, lower, upper, tolerance):
         (6,) or (8,) coordinates, written.
     form
         (2,) constant of C1 and factor of E: (0.33, 0.17) for the full Oren-Nayar model.
-    scan
+    data
         vectors (3, n): c, g1 c, g2 c; f (n,): pi c times the lobe's geometric factor; q (n,):
         theta_h squared; radiance (3, n); weight (3, n): 1 / standard deviation, 0 where not used.
     lower, upper
@@ -324,58 +314,40 @@ def solve(x, form, scan, lower, upper, tolerance):
     -------
     (cost, evaluations, status, valleys descended)
     """
-    vectors, f, q, radiance, weight = scan
-    squares, room = squared(weight), np.empty((3, f.shape[0]))
-    return solve_weighted(
-        x, form, (vectors, f, q, radiance, squares, room), lower, upper, tolerance
-    )
+    vectors, f, q, radiance, weight = data
+    geometry = (vectors, f, q)
+    return solve_weighted(x, form, geometry, radiance, squared(weight), lower, upper, tolerance)
 
 
 @njit(**JIT)
-def solve_weighted(x, form, data, lower, upper, tolerance):
-    """Do what `solve` does for squares of weights; the last of the data is overwritten."""
-    vectors, f, q, radiance, squares, weighted = data
+def solve_weighted(x, form, geometry, radiance, squares, lower, upper, tolerance):
+    """Do what `solve` does for squares of weights."""
+    vectors, f, q = geometry
     nearer, high = nearest_seen(q, squares, lower, upper)
     if nearer > 0:
-        data = (vectors, f, shifted(q, nearer), radiance, squares, weighted)
-    diffuse, columns, blocks = np.empty((3, 9)), np.empty((3, f.shape[0])), nearest(data[2])
-    energy = write_diffuse_products(data, diffuse)
+        q = shifted(q, nearer)
+    scan, columns = (new_scan(form, vectors, f, q, radiance, squares), np.empty(radiance.shape))
+    energy = write_diffuse_products(scan)
     us = widths_between(lower, high)
     lobes = np.empty((us.shape[0], 3, 5))
-    write_sweep(us, data, blocks, columns[0], lobes)
-    reduced = reduced_lobes(diffuse, lobes)
-    found = search(
-        x,
-        form,
-        data,
-        blocks,
-        diffuse,
-        us,
-        lobes,
-        reduced,
-        energy,
-        lower,
-        high,
-        columns,
-        tolerance,
-    )
+    write_sweep(us, scan, columns[0], lobes)
+    sweep = Sweep(us, lobes, reduced_lobes(scan.diffuse, lobes))
+    found = search(x, scan, sweep, None, energy, lower, high, columns, tolerance)
     seen_amplitudes(x, nearer)
     return found
 
 
 @njit(**JIT)
-def refine(x, form, scan, lower, upper, tolerance):
+def refine(x, form, data, lower, upper, tolerance):
     """Descend from x, in place, and nowhere else; parameters and result as for `solve`."""
-    vectors, f, q, radiance, weight = scan
+    vectors, f, q, radiance, weight = data
     squares, last = squared(weight), x.shape[0] - 1
     nearer, high = nearest_seen(q, squares, lower, upper)
-    data = (vectors, f, shifted(q, nearer), radiance, squares, np.empty((3, f.shape[0])))
-    diffuse, columns = np.empty((3, 9)), np.empty((3, f.shape[0]))
-    write_diffuse_products(data, diffuse)
+    scan = new_scan(form, vectors, f, shifted(q, nearer), radiance, squares)
+    columns = np.empty(radiance.shape)
+    write_diffuse_products(scan)
     x[last] = min(x[last], high[last])
     seen_amplitudes(x, -nearer)
-    cost, evaluations, status = descend(
-        x, form, data, nearest(data[2]), diffuse, lower, high, columns, tolerance, MAX_STEPS
-    )
+    cost, evaluations, status = descend(x, scan, lower, high, columns, tolerance, MAX_STEPS)
     seen_amplitudes(x, nearer)
     return cost, evaluations, status, 1

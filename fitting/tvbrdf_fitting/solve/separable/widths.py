@@ -3,14 +3,35 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from ...geometry import FloatArray
 from .elementary import JIT, clip
-from .equations import write_lobe_products
+from .products import write_lobe_products
 
-_STEP = 0.5 * math.log(2.0)
+
+class Sweep(NamedTuple):
+    """What every width that is tried gives.
+
+    Attributes
+    ----------
+    us
+        (w,) ascending.
+    lobes
+        (w, 3, 5) a lobe's products with the vectors, with itself, and with the data.
+    reduced
+        (w, 3, 4) what `reduce_lobe` makes of them.
+    """
+
+    us: FloatArray
+    lobes: FloatArray
+    reduced: FloatArray
+
+
+STEP = 0.5 * math.log(2.0)
 """Between neighbours' u: the scale of q doubles, so a falloff is its neighbour's square."""
 _FEWEST = 3
 _FARTHEST = 680.0
@@ -24,13 +45,13 @@ _NEAR = 2.0
 def widths_between(lower, upper):
     """Return the values of u to be tried, ascending: one where it is fixed.
 
-    All but the first are `_STEP` apart, or closer where the bounds are close.
+    All but the first are `STEP` apart, or closer where the bounds are close.
     """
     low, high = lower[lower.shape[0] - 1], upper[upper.shape[0] - 1]
     if not high > low:
         return np.full(1, low)
-    count = max(math.ceil((high - low) / _STEP - 1e-9), _FEWEST)
-    step = min(_STEP, (high - low) / count) if count == _FEWEST else _STEP
+    count = max(math.ceil((high - low) / STEP - 1e-9), _FEWEST)
+    step = min(STEP, (high - low) / count) if count == _FEWEST else STEP
     us = np.empty(count + 1)
     for k in range(count + 1):
         us[k] = max(low, high - (count - k) * step)
@@ -38,12 +59,12 @@ def widths_between(lower, upper):
 
 
 @njit(**JIT)
-def write_sweep(us, data, blocks, falloff, lobes):
+def write_sweep(us, scan, falloff, lobes):
     """Write a lobe's products for every width: (w, 3, 5). `falloff` (n,) is overwritten."""
     for k in range(us.shape[0]):
-        doubled = k > 1 and abs(us[k] - us[k - 1] - _STEP) < 1e-12
+        doubled = k > 1 and abs(us[k] - us[k - 1] - STEP) < 1e-12
         scale, power = math.exp(2 * us[k]), 2 if doubled else 1
-        write_lobe_products(scale, power, data, blocks, falloff, lobes[k])
+        write_lobe_products(scale, power, scan, falloff, lobes[k])
 
 
 @njit(**JIT)
