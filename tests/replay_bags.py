@@ -16,7 +16,7 @@ from tvbrdf_launch.launch_file import load_launch_file
 from tvbrdf_launch.plan import make_plan
 from tvbrdf_messages.bag import BagWriter
 from tvbrdf_messages.envelope import Envelope
-from tvbrdf_messages.messages import Parameters
+from tvbrdf_messages.messages import Parameters, Radiance
 from tvbrdf_messages.run_directory import Graph
 from tvbrdf_messages.topics import find_topic
 
@@ -68,6 +68,16 @@ def replay_graph(bag: Path, folder: Path, **arguments: Any) -> Graph:
     given = {"bag": bag, "database": folder / "replayed", **arguments}
     words = {name: str(value) for name, value in given.items()}
     return make_plan(load_launch_file(find_launch_file("replay"), words, folder), folder).graph
+
+
+def assert_same_radiance(one: Radiance, other: Radiance) -> None:
+    """Every field is the same, bit for bit."""
+    for field in Radiance.schema():
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if field.array is None:
+            assert a == b, field.name
+        else:
+            np.testing.assert_array_equal(a, b, err_msg=field.name, strict=True)
 
 
 def assert_same_fit(found: Parameters, live: Parameters) -> None:

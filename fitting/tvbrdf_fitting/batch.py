@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .geometry import BoolArray, FloatArray, IntArray, above_horizon
+from .inference.lobe_order import lobe_order
 from .models import SURFACE, ReflectanceModel, get_model
+from .models.base import IDENTITY
 from .observations import Observations
 from .problem import Problem, make_problem
 from .solve import separable
@@ -114,7 +116,9 @@ def fit_parameters(
     )
     values = np.array(
         [
-            [p.transform.to_published(x) for x in column.tolist()]
+            column
+            if p.transform is IDENTITY
+            else [p.transform.to_published(x) for x in column.tolist()]
             for p, column in zip(chosen.parameters, internal.T, strict=True)
         ]
     ).T
@@ -161,6 +165,12 @@ def _unusable(measured: FloatArray, spread: FloatArray) -> ValueError | None:
     return None
 
 
+def _in_order(problem: Problem, internal: FloatArray) -> FloatArray:
+    """Return coordinates (p,) with lobes of one kind in order, as `fit_scan` has them."""
+    order = lobe_order(problem, internal)
+    return internal if order is None else internal[order]
+
+
 def _solve_each(
     problem: Problem, measured: FloatArray, spread: FloatArray, rows: IntArray, method: str
 ) -> tuple[FloatArray, FloatArray, IntArray, BoolArray]:
@@ -173,7 +183,7 @@ def _solve_each(
         problems.append(replace(problem, radiance=radiance, weight=weight))
     solutions = [SOLVERS[method](each) for each in problems]
     return (
-        np.array([s.internal for s in solutions]),
+        np.array([_in_order(problem, s.internal) for s in solutions]),
         np.array([p.cost(s.internal) for p, s in zip(problems, solutions, strict=True)]),
         np.array([s.evaluations for s in solutions], dtype=np.int64),
         np.ones(len(solutions), dtype=bool),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -75,10 +75,9 @@ class ErrorMeasures:
 
     def as_dict(self) -> dict[str, float | int | None]:
         """Return plain numbers by name, None for NaN, so that it is valid JSON."""
-        plain = asdict(self)
         return {
             name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in plain.items()
+            for name, value in vars(self).items()
         }
 
 
@@ -97,7 +96,7 @@ def measure_errors(observations: Observations, predicted_radiance: FloatArray) -
     ValueError
         The prediction's shape is not the observations', or a compared value is not finite.
     """
-    predicted = np.asarray(predicted_radiance, dtype=np.float64)
+    predicted = np.ascontiguousarray(predicted_radiance, dtype=np.float64)
     if predicted.shape != observations.radiance.shape:
         raise ValueError(
             f"predicted radiance has shape {predicted.shape}, "
@@ -110,15 +109,16 @@ def measure_errors(observations: Observations, predicted_radiance: FloatArray) -
         raise ValueError(
             f"predicted radiance[{row}, {channel}] is {predicted[row, channel]}, not finite"
         )
-    residual = np.where(used, predicted - np.where(used, observations.radiance, 0.0), 0.0)
+    residual = np.zeros(used.shape)
+    np.subtract(predicted, observations.radiance, out=residual, where=used)
     measured = observations.radiance[used]
-    counts = used.sum(axis=0)
+    counts = [int(np.count_nonzero(channel)) for channel in used.T]
     squares = np.einsum("ij,ij->j", residual, residual)
-    count = int(counts.sum())
+    count = sum(counts)
     rms = _root_mean(float(squares.sum()), count)
     largest = float(measured.max()) if count else math.nan
     mean = float(measured.mean()) if count else math.nan
-    of_channel = [_root_mean(float(s), int(n)) for s, n in zip(squares, counts, strict=True)]
+    of_channel = [_root_mean(float(s), n) for s, n in zip(squares, counts, strict=True)]
     rms_log, log_counts = _log_measure(observations, predicted)
     return ErrorMeasures(
         rms_percent=100 * _ratio(rms, largest),
@@ -131,9 +131,9 @@ def measure_errors(observations: Observations, predicted_radiance: FloatArray) -
         largest=largest,
         mean=mean,
         count=count,
-        count_b=int(counts[0]),
-        count_g=int(counts[1]),
-        count_r=int(counts[2]),
+        count_b=counts[0],
+        count_g=counts[1],
+        count_r=counts[2],
         log_count=log_counts[0],
         log_dropped_grazing=log_counts[1],
         log_dropped_measured=log_counts[2],
@@ -174,17 +174,14 @@ def _log_measure(
     steep = (observations.light_direction[:, 2] > smallest_cosine) & (
         observations.view_direction[:, 2] > smallest_cosine
     )
-    eligible = used & steep[:, None]
-    bright = eligible & (np.where(used, observations.radiance, 0.0) > LOG_SMALLEST_VALUE)
-    kept = bright & (np.where(used, predicted, 0.0) > LOG_SMALLEST_VALUE)
-    ratio = np.log(predicted[kept] / observations.radiance[kept])
-    count = int(kept.sum())
-    counts = (
-        count,
-        int(used.sum() - eligible.sum()),
-        int(eligible.sum() - bright.sum()),
-        int(bright.sum()) - count,
-    )
+    masks = [used, used & steep[:, None]]
+    for values in (observations.radiance, predicted):
+        bright = np.zeros(used.shape, dtype=bool)
+        np.greater(values, LOG_SMALLEST_VALUE, out=bright, where=masks[-1])
+        masks.append(bright)
+    ratio = np.log(predicted[bright] / observations.radiance[bright])
+    all_used, steep_enough, measured, count = (int(np.count_nonzero(mask)) for mask in masks)
+    counts = (count, all_used - steep_enough, steep_enough - measured, measured - count)
     return _root_mean(float(ratio @ ratio), count), counts
 
 

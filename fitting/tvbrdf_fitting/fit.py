@@ -12,6 +12,7 @@ import numpy as np
 from .error_measures import measure_errors
 from .geometry import FloatArray
 from .inference.determined import bounds_reached, undetermined
+from .inference.lobe_order import in_order
 from .inference.marginal import Asked, Marginal, marginalise
 from .inference.nuisances import CommonErrors, Nuisances, make_nuisances
 from .inference.uncertainty import estimate, published_scale, to_published
@@ -44,6 +45,10 @@ def fit_scan(
     of freedom), noise alone would let the many precise, dark values decide everything and a peak
     be missed. Then the model's own error, one number for all values, is estimated from the
     residuals and added to the variances, until both agree. `metric` says in what it is one number.
+
+    Of several lobes of one kind the broader comes first, one that is not there last, so that a
+    series' parameters go together; not those that are fixed, bounded, tied or started differently
+    (see `lobe_order`).
 
     Parameters
     ----------
@@ -100,7 +105,8 @@ def fit_scan(
     found = fit_reweighted(problem, asked.solve, asked.loss, model_error)
     nuisances = make_nuisances(problem, observations, common_errors)
     marginal = marginalise(found, problem, nuisances, asked)
-    result = _result(observations, nuisances, marginal)
+    named = {*(initial or {}), *(tied or {}), *(tied or {}).values()}
+    result = in_order(_result(observations, nuisances, marginal), problem, named)
     return replace(
         result,
         **_followed(result, problem),
@@ -194,9 +200,11 @@ def _whole_prediction(
     observations: Observations, problem: Problem, internal: FloatArray
 ) -> FloatArray:
     """Predicted radiance (n, 3) in the observations' rows; 0 in the rows that were not fitted."""
-    rows = observations.usable.any(axis=1)
+    rows, predicted = observations.used_rows, problem.predict(internal).T
+    if len(predicted) == len(rows):
+        return predicted
     whole = np.zeros(observations.radiance.shape)
-    whole[rows] = problem.predict(internal).T
+    whole[rows] = predicted
     return whole
 
 

@@ -71,3 +71,21 @@ def as_vectors(direction: ArrayLike) -> FloatArray:
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
         raise ValueError(f"directions must have three components last, got shape {vectors.shape}")
     return vectors
+
+
+def paired(light: ArrayLike, view: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Light and view directions as (n, 3) each, one of them repeated where it is single.
+
+    Raises
+    ------
+    ValueError
+        Other shapes.
+    """
+    lights, views = (np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in (light, view))
+    for name, array in (("light", lights), ("view", views)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ValueError(f"{name} directions have shape {array.shape}, expected (n, 3)")
+    if 1 not in {len(lights), len(views)} and len(lights) != len(views):
+        raise ValueError(f"{len(lights)} light directions but {len(views)} view directions")
+    lights, views = np.broadcast_arrays(lights, views)
+    return lights, views

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .geometry import FloatArray
+from .geometry import FloatArray, paired
 from .models.torrance_sparrow import half_vector
 from .observations import UNIT_LENGTH_TOLERANCE
 
@@ -52,7 +52,7 @@ def to_half_angles(light: ArrayLike, view: ArrayLike) -> HalfAngles:
     ValueError
         Other shapes, or no unit vectors.
     """
-    lights, views = paired(light, view)
+    lights, views = unit_pairs(light, view)
     radius, height = half_vector(lights, views)
     together = np.hypot(radius, height)
     apart = lights - views
@@ -93,7 +93,7 @@ def from_half_angles(
     return turned(half + side), turned(half - side)
 
 
-def paired(light: ArrayLike, view: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def unit_pairs(light: ArrayLike, view: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return light and view directions as (n, 3) each, one of them repeated where it is single.
 
     Raises
@@ -101,15 +101,10 @@ def paired(light: ArrayLike, view: ArrayLike) -> tuple[FloatArray, FloatArray]:
     ValueError
         Other shapes, or no unit vectors.
     """
-    lights, views = (np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in (light, view))
+    lights, views = paired(light, view)
     for name, array in (("light", lights), ("view", views)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name} directions have shape {array.shape}, expected (n, 3)")
         unit = np.abs(np.linalg.norm(array, axis=1) - 1) <= UNIT_LENGTH_TOLERANCE
         if not unit.all():
             row = int(np.argmin(unit))
             raise ValueError(f"{name} direction {row} = {array[row].tolist()} is no unit vector")
-    if 1 not in {len(lights), len(views)} and len(lights) != len(views):
-        raise ValueError(f"{len(lights)} light directions but {len(views)} view directions")
-    lights, views = np.broadcast_arrays(lights, views)
     return lights, views

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,19 @@ from .geometry import CHANNELS, BoolArray, FloatArray, IntArray, above_horizon
 
 UNIT_LENGTH_TOLERANCE = 1e-4
 """Directions in published files have six decimals; anything further from length 1 is an error."""
+_DTYPES: dict[str, type] = {
+    "light_direction": np.float64,
+    "view_direction": np.float64,
+    "radiance": np.float64,
+    "variance": np.float64,
+    "valid": np.bool_,
+    "camera": np.int64,
+    "sweep": np.int64,
+    "exposure_ms": np.float64,
+    "time_s": np.float64,
+}
+"""Of every field."""
+_ONE_A_ROW = frozenset({"camera", "sweep", "exposure_ms", "time_s"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +69,13 @@ class Observations:
     time_s: FloatArray
 
     def __post_init__(self) -> None:
-        dtypes: dict[str, type] = {"valid": np.bool_, "camera": np.int64, "sweep": np.int64}
-        for field in fields(self):
-            given = np.asarray(getattr(self, field.name))
-            dtype = dtypes.get(field.name, np.float64)
-            if dtype is np.int64 and not np.issubdtype(given.dtype, np.integer):
-                raise ValueError(f"observations: {field.name} must be integers, not {given.dtype}")
+        for name, dtype in _DTYPES.items():
+            given = np.asarray(getattr(self, name))
+            if dtype is np.int64 and given.dtype.kind not in "iu":
+                raise ValueError(f"observations: {name} must be integers, not {given.dtype}")
             array: np.ndarray[Any, Any] = given.astype(dtype, copy=True)
             array.setflags(write=False)
-            object.__setattr__(self, field.name, array)
+            object.__setattr__(self, name, array)
         self._check_shapes()
         for name in ("light_direction", "view_direction"):
             self._check_directions(name)
@@ -71,19 +83,27 @@ class Observations:
             self._refuse(name, ~np.isfinite(getattr(self, name)), "is not finite")
         self._refuse("exposure_ms", self.exposure_ms <= 0, "is not positive")
         self._refuse("camera", self.camera < 1, "is below 1")
-        remedy = "; mark what could not be measured as not valid"
-        self._refuse("radiance", ~np.isfinite(self.radiance) & self.valid, f"is not finite{remedy}")
-        self._refuse("variance", ~np.isfinite(self.variance) & self.valid, f"is not finite{remedy}")
-        self._refuse("variance", ~(self.variance > 0) & self.valid, "is not positive")
+        finite = np.isfinite(self.radiance) & np.isfinite(self.variance)
+        if not (finite & (self.variance > 0) | ~self.valid).all():
+            self._refuse_values()
 
     def __len__(self) -> int:
         return int(self.light_direction.shape[0])
 
-    @property
+    @cached_property
     def usable(self) -> BoolArray:
         """(n, 3) mask of what a fit uses: valid, with light and camera above the horizon."""
         above = above_horizon(self.light_direction) & above_horizon(self.view_direction)
-        return self.valid & above[:, None]
+        mask = self.valid & above[:, None]
+        mask.setflags(write=False)
+        return mask
+
+    @cached_property
+    def used_rows(self) -> BoolArray:
+        """(n,) mask of the rows with a channel that a fit uses."""
+        mask = np.asarray(self.usable.any(axis=1))
+        mask.setflags(write=False)
+        return mask
 
     @property
     def cosine_light(self) -> FloatArray:
@@ -92,7 +112,7 @@ class Observations:
 
     def select(self, rows: BoolArray | IntArray | slice) -> Observations:
         """Return some of the rows (mask, indices or slice)."""
-        return Observations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return Observations(**{name: getattr(self, name)[rows] for name in _DTYPES})
 
     @staticmethod
     def concatenate(parts: Sequence[Observations]) -> Observations:
@@ -100,36 +120,40 @@ class Observations:
         if not parts:
             raise ValueError("observations: nothing to concatenate")
         return Observations(
-            **{
-                f.name: np.concatenate([getattr(part, f.name) for part in parts])
-                for f in fields(Observations)
-            }
+            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _DTYPES}
         )
 
     def _check_shapes(self) -> None:
         rows = self.radiance.shape[0] if self.radiance.ndim else 0
-        for field in fields(self):
-            shape = getattr(self, field.name).shape
-            wide = field.name not in {"camera", "sweep", "exposure_ms", "time_s"}
-            expected = (rows, 3) if wide else (rows,)
+        for name in _DTYPES:
+            shape = getattr(self, name).shape
+            expected = (rows,) if name in _ONE_A_ROW else (rows, 3)
             if shape != expected:
                 raise ValueError(
-                    f"observations: {field.name} has shape {shape}, expected {expected} "
+                    f"observations: {name} has shape {shape}, expected {expected} "
                     f"to go with {rows} rows of radiance"
                 )
 
     def _check_directions(self, name: str) -> None:
         vectors = getattr(self, name)
-        self._refuse(name, ~np.isfinite(vectors), "is not finite")
         length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-        wrong = np.abs(length - 1) > UNIT_LENGTH_TOLERANCE
+        wrong = ~(np.abs(length - 1) <= UNIT_LENGTH_TOLERANCE)  # so is one that is not finite
         if wrong.any():
+            self._refuse(name, ~np.isfinite(vectors), "is not finite")
             row = int(np.argmax(wrong))
             raise ValueError(
                 f"observations: {name}[{row}] = {vectors[row].tolist()} has length "
                 f"{length[row]:.6g}, not 1; directions must be unit vectors "
                 f"({int(wrong.sum())} of {len(self)} are not)"
             )
+
+    def _refuse_values(self) -> None:
+        """Say which valid radiance or variance can't be used."""
+        remedy = "; mark what could not be measured as not valid"
+        for name in ("radiance", "variance"):
+            wrong = ~np.isfinite(getattr(self, name)) & self.valid
+            self._refuse(name, wrong, f"is not finite{remedy}")
+        self._refuse("variance", ~(self.variance > 0) & self.valid, "is not positive")
 
     def _refuse(self, name: str, wrong: BoolArray, what: str) -> None:
         if not wrong.any():

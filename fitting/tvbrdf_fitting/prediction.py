@@ -37,7 +37,7 @@ from .choice.choose import ModelChoice
 from .choice.ladder import DEFAULT_LADDER, Scan, as_ladder, find
 from .choice.rule import DECISIVE
 from .geometry import BoolArray, FloatArray
-from .half_angle import paired
+from .half_angle import unit_pairs
 from .inference.nuisances import CommonErrors
 from .inference.posterior import Posterior, maximise
 from .inference.uncertainty import estimate
@@ -270,7 +270,7 @@ class _Directions:
     """A model in n directions, in internal coordinates; arrays are (3, n)."""
 
     def __init__(self, model: ReflectanceModel, light: ArrayLike, view: ArrayLike) -> None:
-        lights, views = paired(light, view)
+        lights, views = unit_pairs(light, view)
         above = (lights[:, 2] > 0) & (views[:, 2] > 0)
         normal = np.array([0.0, 0.0, 1.0])
         self.model = model

@@ -74,19 +74,16 @@ def bars(histogram: NDArray[np.int64]) -> str:
     return "".join(_BARS[level] for level in levels)
 
 
-def merge_exposures(
+def merge_stills(
     frames: Sequence[Frame], camera: CameraCalibration
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Merge stills of one camera into linear radiance, pixel by pixel, by their noise.
-
-    Each pixel is the mean of ``(linear dn - black level) / exposure · radiance_per_dn_per_ms`` over
-    the exposures in which it is not saturated, weighted by the inverse variance that photons and
-    read-out give it. Where all are saturated, the shortest exposure is taken: a lower limit.
+    """Merge stills of one camera, one an exposure, into linear radiance.
 
     Returns
     -------
     radiance
-        (height, width, 3), float32, channels B, G, R; 1 is a white diffuser facing the light.
+        (height, width, 3), float32, channels B, G, R; 1 is a white diffuser facing the light. Where
+        all exposures are saturated, the shortest one's: a lower limit.
     known
         Whether any exposure was not saturated there, same shape.
 
@@ -95,27 +92,15 @@ def merge_exposures(
     ValueError
         If the frames differ in shape, or are of other bits than the calibration.
     """
+    from tvbrdf_fitting.measurement.exposure_merge import PixelRadiance, merge_exposures
+
     shapes = {frame.image.shape for frame in frames}
     if len(shapes) != 1:
         raise ValueError(f"stills of {len(shapes)} shapes: {sorted(shapes)}")
     calibrated = camera.with_bit_depth(frames[0].bit_depth)
-    scale = np.asarray(calibrated.radiance_per_dn_per_ms)
-    total = np.zeros(frames[0].image.shape)
-    weights = np.zeros_like(total)
-    for frame in frames:
-        linear = calibrated.response.linear_table(calibrated.bit_depth)[frame.image]
-        signal = linear - calibrated.black_level_dn
-        good = frame.image < calibrated.saturation_dn
-        variance = calibrated.pixel_variance_dn2(np.maximum(signal, 0.0))
-        weight = np.where(good, (frame.exposure_ms / scale) ** 2 / variance, 0.0)
-        total += weight * signal * scale / frame.exposure_ms
-        weights += weight
-    known = weights > 0
-    shortest = min(frames, key=lambda frame: frame.exposure_ms)
-    table = calibrated.response.linear_table(calibrated.bit_depth)
-    limit = (table[shortest.image] - calibrated.black_level_dn) * scale / shortest.exposure_ms
-    merged = np.where(known, total / np.where(known, weights, 1.0), limit)
-    return merged.astype(np.float32), known
+    pixels = PixelRadiance(calibrated, calibrated.black_level_dn)
+    exposed = [pixels.exposed(frame.image, frame.exposure_ms) for frame in frames]
+    return merge_exposures(exposed, calibrated)
 
 
 def write_png(path: Path, frame: Frame) -> None:

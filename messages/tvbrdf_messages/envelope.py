@@ -44,15 +44,16 @@ _EPOCH_MARK = "~"
 
 
 def in_epoch(incarnation: str, epoch: int) -> str:
-    """Return a recorded incarnation as it is played in a later epoch (after a loop or a seek).
+    """Return an incarnation as it is in a later epoch of a replay (after a loop or a seek).
 
-    A message tells its epoch itself: ``/clock`` has no order with other topics.
+    A message tells its epoch itself: ``/clock`` has no order with other topics. So do those that
+    nodes make of what is played.
     """
     return f"{incarnation}{_EPOCH_MARK}{epoch}"
 
 
 def epoch_of(incarnation: str) -> int:
-    """Return the epoch in which a recorded message is played again; 0: no clock has jumped."""
+    """Return the epoch of a replay in which a message was sent; 0: no clock has jumped."""
     epoch = incarnation.rpartition(_EPOCH_MARK)[2] if _EPOCH_MARK in incarnation else ""
     return int(epoch) if epoch.isdecimal() else 0
 

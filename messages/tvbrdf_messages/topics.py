@@ -45,7 +45,7 @@ class Topic(NamedTuple):
 _TABLE = (
     Topic("/clock", m.Clock, LATEST, 10, False, text="the run's clock (simulation, replay)"),
     Topic("/scan/command", m.ScanCommand, COMMAND, 0, True, text="what to do next"),
-    Topic("/replay/command", m.ScanCommand, COMMAND, 0, False, text="what a bag was told to do"),
+    Topic("/replay/command", m.ScanCommand, COMMAND, 0, True, text="what a bag was told to do"),
     Topic("/scan/sweep_result", m.SweepResult, COMMAND, 0, True, text="a sweep is good or broken"),
     Topic("/arm/state", m.ArmState, LOSSLESS, 50, True, text="where the light was when"),
     Topic("/{camera}/info", m.CameraInfo, COMMAND, 0, True, True, "what a camera is"),

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+from scipy.optimize import isotonic_regression
+
+from tvbrdf_fitting.geometry import BoolArray, FloatArray
 
 from .style import (
     FAINT,
@@ -37,9 +43,15 @@ CAMERA_MARKERS = ("v", "D", "s", "o")
 SMALLEST_ERROR = 1e-5
 LARGEST_ERROR = 1.0
 """Errors beyond are drawn here: a logarithmic axis has no 0, and what is lost is lost."""
+PALE, PALE_SIZE = 0.3, 4.0
+"""Opacity and size of points with fewer cameras than there are."""
 NUMBER_SIZE = 8
-NUMBER_ROOM = (0.35, 0.22)
-"""Factors of ten in time and in error that a number needs for itself."""
+NUMBER_ROOM_PT = 11.0
+"""Height that a number needs for itself."""
+NUMBER_AWAY_PT = 14.0
+"""How far from all points numbers stand."""
+NUMBER_LENGTH = 4.0
+"""Factor in time that is kept free for numbers beside the fastest point."""
 
 
 class Measured(Protocol):
@@ -91,9 +103,11 @@ def speed_error_figure(cells: Sequence[Measured], *, title: str) -> Figure:
     """Draw a column a noise level; two panels beside each other where there is only one.
 
     Above: error of 95 % of the fits against the time of one, both logarithmic; a marker a
-    combination, faint where not all cameras were used; numbers are those of lights; the line is the
-    Pareto front, beyond which nothing is both faster and better. Below: error against the number of
-    lights, a line a number of cameras, for the separable solver; dashed is the median.
+    combination, small and pale where not all cameras were used; the line is the Pareto front,
+    beyond which nothing is both faster and better. Numbers are those of lights, at the points of
+    the front's solver with all cameras: the other solvers' errors are nearly the same. Below: error
+    against the number of lights, a line a number of cameras, for the separable solver; dashed is
+    the median.
     """
     exact = [c for c in cells if c.precision == "float64"]
     noises = list(dict.fromkeys(c.noise for c in exact))
@@ -115,6 +129,7 @@ def speed_error_figure(cells: Sequence[Measured], *, title: str) -> Figure:
         axes[row, 0].set_ylabel("error of the BRDF", fontsize=LABEL_SIZE, color=INK)
     figure.suptitle(title, fontsize=TITLE_SIZE, color=INK)
     _legend_below(figure, exact)
+    _number(figure, {axes[0, i]: [c for c in exact if c.noise == n] for i, n in enumerate(noises)})
     return figure
 
 
@@ -150,9 +165,9 @@ def _time_panel(axes: Axes, cells: Sequence[Measured]) -> None:
                 [_shown(c.brdf_95) for c in chosen],
                 linestyle="none",
                 marker=marker,
-                markersize=6.5 if whole else 4,
+                markersize=6.5 if whole else PALE_SIZE,
                 color=colour,
-                alpha=1.0 if whole else 0.3,
+                alpha=1.0 if whole else PALE,
                 markeredgecolor="white",
                 markeredgewidth=0.6,
                 zorder=3 if whole else 2,
@@ -168,32 +183,72 @@ def _time_panel(axes: Axes, cells: Sequence[Measured]) -> None:
     )
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    for cell in _apart([c for c in cells if c.cameras == most]):
-        axes.annotate(
-            str(cell.lights),
-            (cell.time_ms, _shown(cell.brdf_95)),
-            xytext=(6, 3),
-            textcoords="offset points",
-            fontsize=NUMBER_SIZE,
-            color=_look(cell.solver)[0],
-            path_effects=[withStroke(linewidth=2.0, foreground="white")],
-            zorder=4,
-        )
 
 
-def _apart(cells: Sequence[Measured]) -> list[Measured]:
-    """Leave out those too near to one that is kept, so that numbers can be read."""
-    kept: list[Measured] = []
-    for cell in sorted(cells, key=lambda c: (not c.fast, c.lights)):
-        x, y = math.log10(cell.time_ms), math.log10(_shown(cell.brdf_95))
-        near = (
-            abs(x - math.log10(k.time_ms)) < NUMBER_ROOM[0]
-            and abs(y - math.log10(_shown(k.brdf_95))) < NUMBER_ROOM[1]
-            for k in kept
-        )
-        if not any(near):
-            kept.append(cell)
-    return kept
+def _number(figure: Figure, panels: Mapping[Axes, Sequence[Measured]]) -> None:
+    """Write the number of lights beside the points of each panel's leading solver."""
+    for axes, cells in panels.items():
+        fastest = min(c.time_ms for c in cells) / NUMBER_LENGTH
+        axes.set_xlim(left=min(fastest, axes.get_xlim()[0]))
+    figure.draw_without_rendering()  # lays the axes out: where points are is known from here on
+    point = figure.dpi / 72
+    for axes, cells in panels.items():
+        named = _named(cells)
+        places = axes.transData.transform([(c.time_ms, _shown(c.brdf_95)) for c in named]) / point
+        limits = axes.bbox.y0 / point + NUMBER_SIZE, axes.bbox.y1 / point
+        right = _to_the_right(places)
+        for side, edge, sign in ((~right, places[:, 0].min(), -1), (right, places[:, 0].max(), 1)):
+            rows = np.flatnonzero(side)
+            heights = _spread(places[rows, 1], NUMBER_ROOM_PT, *limits)
+            for row, height in zip(rows, heights, strict=True):
+                there = np.array([edge + sign * NUMBER_AWAY_PT, height])
+                _annotate(axes, named[row], there - places[row])
+
+
+def _annotate(axes: Axes, cell: Measured, away_pt: FloatArray) -> None:
+    axes.annotate(
+        str(cell.lights),
+        (cell.time_ms, _shown(cell.brdf_95)),
+        xytext=(float(away_pt[0]), float(away_pt[1])),
+        textcoords="offset points",
+        ha="left" if away_pt[0] > 0 else "right",
+        va="center",
+        fontsize=NUMBER_SIZE,
+        color=INK,
+        path_effects=[withStroke(linewidth=2.0, foreground="white")],
+        arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.6, "shrinkA": 1},
+        zorder=4,
+    ).set_in_layout(False)
+
+
+def _to_the_right(places: FloatArray) -> BoolArray:
+    """Whether a point's number stands right of all points (n, 2), as another is in its way left."""
+    x, y = places.T
+    level = np.abs(y[:, None] - y) < NUMBER_ROOM_PT / 2
+    blocked = (level & (x < x[:, None])).any(axis=1), (level & (x > x[:, None])).any(axis=1)
+    return np.asarray(blocked[0] & ~blocked[1])
+
+
+def _named(cells: Sequence[Measured]) -> list[Measured]:
+    """Return one solver's points with all cameras: that with most of the front."""
+    solvers = [c.solver for c in cells if c.fast] or [c.solver for c in cells]
+    leader = Counter(solvers).most_common(1)[0][0]
+    chosen = [c for c in cells if c.solver == leader]
+    most = max(c.cameras for c in chosen)
+    return [c for c in chosen if c.cameras == most]
+
+
+def _spread(wanted: FloatArray, room: float, lowest: float, highest: float) -> FloatArray:
+    """Return places at least `room` apart, near the wanted ones, within limits if they fit."""
+    if not len(wanted):
+        return wanted
+    order = np.argsort(wanted, kind="stable")
+    steps = room * np.arange(len(wanted))
+    # places less their steps must not fall: the nearest such ones are a monotone regression
+    even = isotonic_regression(wanted[order] - steps).x
+    out = np.empty(len(wanted))
+    out[order] = np.clip(even, lowest, max(lowest, highest - steps[-1])) + steps
+    return out
 
 
 def _lights_panel(axes: Axes, cells: Sequence[Measured]) -> None:
@@ -234,7 +289,7 @@ def _dress(axes: Axes) -> None:
 
 
 def _legend_below(figure: Figure, cells: Sequence[Measured]) -> None:
-    """Two rows: what the upper panels show, and what the lower ones do."""
+    """Two rows: what the upper panels show, and what the lower ones do; then `_notes`."""
     upper = [
         Line2D([], [], color=colour, marker=marker, linestyle="none", markersize=6.5, label=solver)
         for solver in dict.fromkeys(c.solver for c in cells)
@@ -248,14 +303,23 @@ def _legend_below(figure: Figure, cells: Sequence[Measured]) -> None:
         lower.append(Line2D([], [], color=colour, marker=marker, label=name))
     lower.append(Line2D([], [], color=FAINT, linestyle="--", label="median, else 95 % of fits"))
     blank = Line2D([], [], linestyle="none", label=" ")
-    columns = max(len(upper), len(lower))
-    rows = [[*row, *[blank] * (columns - len(row))] for row in (upper, lower)]
+    pairs = [*zip_longest(upper, lower, fillvalue=blank), _notes(cells, blank)]
     figure.legend(
-        handles=[handle for pair in zip(*rows, strict=True) for handle in pair],
+        handles=[handle for pair in pairs for handle in pair],
         loc="outside lower center",
-        ncols=columns,
+        ncols=len(pairs),
         frameon=False,
         fontsize=TICK_SIZE,
         handletextpad=0.5,
         columnspacing=1.6,
     )
+
+
+def _notes(cells: Sequence[Measured], blank: Line2D) -> tuple[Line2D, Line2D]:
+    """Return a legend's entries for pale points, where there are any, and for numbers."""
+    most = max(c.cameras for c in cells)
+    pale = Line2D([], [], color=INK, marker="o", linestyle="none", label="pale: fewer cameras")
+    pale.set(alpha=PALE, markersize=PALE_SIZE, markeredgecolor="white")
+    number = Line2D([], [], color=INK, marker="$24$", linestyle="none", label="number of lights")
+    number.set(markersize=10, markeredgewidth=0)
+    return (pale if any(c.cameras < most for c in cells) else blank), number

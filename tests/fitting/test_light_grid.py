@@ -14,14 +14,22 @@ from tests.paths import CALIBRATION_FILE
 from tvbrdf_fitting.geometry import light_direction
 from tvbrdf_fitting.measurement.calibration import Calibration, load_calibration
 from tvbrdf_fitting.measurement.light_grid import (
+    Interpolated,
+    Stencils,
     grid_angles_deg,
-    interpolate,
     merge_on_grid,
     visible_positions,
 )
 from tvbrdf_fitting.measurement.scan_merge import ScanObservations
 
 FloatArray = NDArray[np.float64]
+
+
+def interpolate(
+    angle_deg: FloatArray, value: FloatArray, variance: FloatArray, grid_deg: FloatArray
+) -> Interpolated:
+    """Bring one curve to grid positions."""
+    return Stencils(angle_deg, grid_deg).apply(value, variance)
 
 
 @pytest.fixture(scope="module")

@@ -250,6 +250,30 @@ def test_names_aliases_and_forms() -> None:
         get_model("ON+TS", form="paper")
 
 
+@pytest.mark.parametrize(
+    ("name", "full"),
+    [
+        ("ON", "oren_nayar"),
+        ("ON+TS(coloured)", "oren_nayar+torrance_sparrow(coloured)"),
+        ("lambert+TS+TS", "lambert+torrance_sparrow+torrance_sparrow"),
+        ("ON + TS( coloured )", "oren_nayar+torrance_sparrow(coloured)"),
+        ("dust+ON+TS(coloured)", "dust+oren_nayar+torrance_sparrow(coloured)"),
+        ("dust(paper)+lambert+TS", "dust(paper)+lambert+torrance_sparrow"),
+        ("dust(blinn)", "dust(blinn)+oren_nayar+torrance_sparrow"),
+        ("cook_torrance(coloured,ggx)", "cook_torrance(ggx,coloured)"),
+    ],
+)
+def test_aliases_work_in_sums(name: str, full: str) -> None:
+    assert get_model(name).name == full
+    assert get_model(name) is get_model(full)
+
+
+@pytest.mark.parametrize("name", ["on+ts", "ON+TS(shiny)", "TS+dust", "ON TS", "ON+", ""])
+def test_what_is_no_name_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="model"):
+        get_model(name)
+
+
 def test_wrong_shapes_and_values_are_refused() -> None:
     model = get_model("ON+TS")
     light = random_directions(1, 4)

@@ -37,6 +37,7 @@ from tvbrdf_fitting.published.checks import (
     diffuse_colour,
     order_of,
 )
+from tvbrdf_fitting.published.compiled import add_differences, running_mean
 from tvbrdf_fitting.published.observations import ROUNDING, SMALLEST_RELATIVE
 
 EXPOSURES_MS = (0.2, 4.0, 32.0)
@@ -90,6 +91,33 @@ def test_noise_is_found_from_neighbouring_lights(noise: float) -> None:
     # a bin's median of 100 squares scatters by 17 % (8 % of a deviation); three terms smooth that
     assert 0.85 < np.median(ratio) < 1.15
     assert np.mean((ratio > 0.7) & (ratio < 1.4)) > 0.95
+
+
+def test_differences_are_what_no_parabola_explains() -> None:
+    """Of four values, the part along the one unit vector that is normal to all parabolas."""
+    rng = np.random.default_rng(3)
+    angle = np.cumsum(rng.uniform(0.5, 1.5, 12))
+    angle[7:] += 10.0  # a gap: no difference reaches across
+    values = rng.standard_normal((12, 3))
+    square, level = np.full((3, 12), -1.0), np.full((3, 12), -1.0)
+    count = add_differences(angle, values, 5.0, square, level, 2)
+    starts = [0, 1, 2, 3, 7, 8]
+    assert count == 2 + len(starts)
+    for place, start in enumerate(starts, start=2):
+        four = slice(start, start + 4)
+        normal = np.linalg.svd(np.vander(angle[four], 3).T)[2][-1]
+        np.testing.assert_allclose(square[:, place], (normal @ values[four]) ** 2, rtol=1e-9)
+        np.testing.assert_allclose(level[:, place], values[four].mean(axis=0), rtol=1e-12)
+    assert (square[:, [0, 1, *range(count, 12)]] == -1.0).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 9])
+def test_a_running_mean_takes_fewer_values_at_the_ends(count: int) -> None:
+    values = np.random.default_rng(count).standard_normal((count, 3))
+    kernel = np.ones(min(5, count))
+    number = np.convolve(np.ones(count), kernel, mode="same")
+    expected = [np.convolve(channel, kernel, mode="same") / number for channel in values.T]
+    np.testing.assert_array_equal(running_mean(values, 5), np.transpose(expected))
 
 
 def test_a_peak_is_not_taken_for_noise() -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -300,3 +304,26 @@ def test_a_given_start_leads_into_its_own_valley(simulate: Simulate) -> None:
     # only a width far off is given: the other coordinates are its best ones, then all descend
     wide = make_problem(observations, model, {}, {"inverse_sigma_s": 0.8})
     assert wide.cost(SOLVERS["separable"](wide).internal) >= wide.cost(best.internal) * (1 - 1e-12)
+
+
+def test_stale_compiled_code_is_removed_before_it_is_read(tmp_path: Path) -> None:
+    """numba would read what an old index names, and fail where that has moved."""
+    where = (
+        "from tvbrdf_fitting.solve import separable; from tvbrdf_fitting.solve.separable import "
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def run(code: str) -> str:
+        command = [sys.executable, "-c", where + code]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    folder = Path(run("search; print(search.solve.stats.cache_path)"))
+    folder.mkdir(parents=True, exist_ok=True)
+    stale, new = folder / "search.solve-1.py311.nbi", folder / "search.refine-1.py311.nbi"
+    for index in (stale, new):
+        index.write_bytes(b"no index")
+    os.utime(stale, (1, 1))
+    run("search; separable.forget_stale_code()")
+    assert not stale.exists()
+    assert new.exists()

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from tests.launch.refit_inputs import inside
-from tests.messages.bag_samples import START_NS, header
+from tests.messages.bag_samples import header
 from tests.replay.process_replay import BAG, RESULTS
 from tests.replay.recorded_rig import read_all, write_bag
+from tests.sample_messages import START_NS
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import Log, Mark, Radiance, ScanMissing
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from tests.messages.bag_samples import START_NS, arm_state, plain, read, rig_messages, write
+from tests.messages.bag_samples import arm_state, plain, read, rig_messages, write
+from tests.sample_messages import START_NS
 from tvbrdf_launch.cli import main
 
 SECOND_NS = 10**9
@@ -84,6 +85,18 @@ def test_info_tells_gaps_and_files(tmp_path: Path, shell: Shell) -> None:
     assert [49, 51] in stream["gaps"]
 
 
+def test_info_tells_jumps_of_clocks(tmp_path: Path, shell: Shell) -> None:
+    """By log time alone this one looks like a pause of an hour."""
+    told = [arm_state(k, START_NS + k * 20_000_000) for k in range(20)]
+    told[10:] = [each._replace(log_time_ns=each.log_time_ns + 3600 * 10**9) for each in told[10:]]
+    bag = write(tmp_path / "a.mcap", told)
+    text = shell.good("info", bag)
+    assert "Jumps of clocks:\n  /arm/state, 3600.200 s after the start: log time leaps" in text
+    (jump,) = shell.parsed("info", bag)["clock_jumps"]
+    assert jump["log_time_ns"] == told[10].log_time_ns
+    assert "Jumps" not in shell.good("info", write(tmp_path / "b.mcap", told[:10]))
+
+
 def test_info_of_an_empty_recording(tmp_path: Path, shell: Shell) -> None:
     text = shell.good("info", write(tmp_path / "a.mcap", [], attachments={}))
     assert "Topics: none" in text
@@ -137,6 +150,16 @@ def test_recover(bag: Path, shell: Shell) -> None:
     assert found["messages"] == len(read(out))
     assert found["complete"] is False
     assert found["lost_bytes"] == sum(lost["bytes"] for lost in found["lost"]) > 0
+
+
+def test_recover_after_one_that_was_killed(bag: Path, shell: Shell) -> None:
+    out = bag.with_name("saved.mcap")
+    left = out.with_name(".saved.mcap.tvbrdf-12345678")
+    left.mkdir()
+    (left / "saved.mcap").write_bytes(bag.read_bytes()[:1000])
+    text = shell.good("recover", bag, "-o", out)
+    assert f"removed {left}: what a run that was killed had left" in text.splitlines()[0]
+    assert not left.exists()
 
 
 def test_recover_of_a_whole_bag(bag: Path, shell: Shell) -> None:

@@ -268,7 +268,10 @@ def test_all_of_a_scan_agrees_with_itself(sample: Path) -> None:
     assert all(c.noise is None and 0 < (c.rms_percent or 0) < 1e-3 for c in cells)
 
 
-def test_a_missing_or_broken_sample_is_one_line(sample: Path, tmp_path: Path) -> None:
+def test_a_missing_or_broken_sample_is_one_line(
+    sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(RunError, match="tvBrdf-data"):
         run(str(tmp_path / "nothing"))
     with pytest.raises(RunError, match="no file of scan 09"):
@@ -282,6 +285,7 @@ def test_a_missing_or_broken_sample_is_one_line(sample: Path, tmp_path: Path) ->
     path.write_text(path.read_text()[:-20])
     with pytest.raises(RunError, match=r"camera3.* is truncated"):
         run(str(sample))
+    assert not (tmp_path / "out").exists()  # nothing is left of what could not begin
 
 
 # -- what is written

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +81,40 @@ def test_json(bag: Path, tmp_path: Path, shell: Shell) -> None:
             }
         ],
         "left_out": {},
+        "removed": [],
     }
     assert names(out) == ["export.json", "text"]
+
+
+STOPS = """
+import sys
+from pathlib import Path
+from tvbrdf_launch.export import export_bag
+
+def tell(fraction, what):
+    if fraction > 0:
+        print("busy", flush=True)
+        sys.stdin.read()
+
+export_bag(Path(sys.argv[1]), Path(sys.argv[2]), tell=tell)
+"""
+
+
+def test_what_one_that_was_killed_had_left_is_removed(
+    bag: Path, tmp_path: Path, shell: Shell
+) -> None:
+    out = tmp_path / "out"
+    pipe, command = subprocess.PIPE, [sys.executable, "-c", STOPS, str(bag), str(out)]
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"busy\n"
+        (left,) = tmp_path.iterdir()
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+    assert left.is_dir()
+    first, *_ = shell.good(bag, "-o", out, "-f", "text").splitlines()
+    assert first == f"removed {left}: what a run that was killed had left of the same output"
+    assert names(tmp_path) == ["out"]
 
 
 def test_what_a_bag_has_no_messages_for_is_told(tmp_path: Path, shell: Shell) -> None:

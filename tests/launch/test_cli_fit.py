@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from tests.launch.published_samples import (
     write_sample,
 )
 from tvbrdf_fitting import CommonErrors, Observations, fit_scan
+from tvbrdf_fitting.choice.choose import choose_model
 from tvbrdf_fitting.models import SURFACE
 from tvbrdf_fitting.published import (
     SampleInfo,
@@ -34,7 +35,9 @@ from tvbrdf_fitting.published import (
     write_calibration,
     write_info,
 )
+from tvbrdf_launch.cli._fit_tables import decimals, scan_lines, series_lines
 from tvbrdf_nodes.database_writer.store import DatabaseStore, ScanRecord
+from tvbrdf_rendering.fit_report import FittedSample, FittedScan
 
 
 def test_one_scan_is_printed_in_full(fit: Fit, sample: Path) -> None:
@@ -123,8 +126,32 @@ def test_the_chosen_model_comes_with_its_reasons(fit: Fit, sample: Path) -> None
     assert f"chosen because {SURFACE}: noise explains the data" in text
     assert "- lambert: the kept one is better by" in text
     choice = fit(sample, "--no-pictures", "--model", "auto", "--json").json()["samples"][0]
-    rungs = choice["scans"][0]["choice"]["rungs"]
+    scan = choice["scans"][0]
+    rungs = scan["choice"]["rungs"]
     assert [rung["model"] for rung in rungs if not rung["rejected"]] == [SURFACE]
+
+
+def test_deviations_over_the_models_are_printed() -> None:
+    observations = observe(PAINT, seed=1)
+    choice = choose_model(observations)
+    choice = replace(choice, standard_deviations=3 * choice.standard_deviations)
+    scans = tuple(
+        FittedScan(n, None, (4.0,), observations, "frames", choice.result, choice) for n in (1, 2)
+    )
+    lines = scan_lines(FittedSample("paint", "", Path(), scans[:1]))
+    rows = {line.split()[0]: line.split()[1:4] for line in lines if line.split()}
+    assert any("± deviation  ± over models" in line for line in lines)
+    fit = choice.result
+    for name, alone in zip(fit.parameter_names, fit.standard_deviations.tolist(), strict=True):
+        assert [float(cell) for cell in rows[name][1:]] == pytest.approx(
+            [alone, 3 * alone],
+            rel=0.06,  # two digits
+        )
+    text = "\n".join(series_lines(FittedSample("paint", "", Path(), scans)))
+    for value, alone in zip(fit.values.tolist(), fit.standard_deviations.tolist(), strict=True):
+        places = decimals(3 * alone)
+        assert f"{value:.{places}f} ± {3 * alone:.{places}f}" in text
+    assert "how far the models differ that explain the data as well" in text
 
 
 def test_a_sample_is_printed_with_a_line_a_scan_and_trends(fit: Fit, tmp_path: Path) -> None:

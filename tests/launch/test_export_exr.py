@@ -14,9 +14,10 @@ import pytest
 
 from tests.launch.export_inputs import the_radiance
 from tests.launch.refit_inputs import copy_bag, inside, shuffled
-from tests.messages.bag_samples import START_NS, header
+from tests.messages.bag_samples import header
 from tests.replay.process_replay import BAG
 from tests.replay.recorded_rig import read_all, write_bag
+from tests.sample_messages import START_NS
 from tvbrdf_fitting.geometry import light_direction
 from tvbrdf_fitting.measurement.calibration import CameraCalibration, parse_calibration
 from tvbrdf_launch.errors import RunError
@@ -26,9 +27,7 @@ from tvbrdf_launch.export.hdr import (
     BLOCK_FRAMES,
     KEPT_BLOCKS,
     BlockReader,
-    Exposed,
     hdr_images,
-    merge,
 )
 from tvbrdf_launch.export.scans import CameraSweep, LitFrame, Place
 from tvbrdf_messages.bag import BagReader
@@ -179,56 +178,6 @@ def test_images_do_not_depend_on_the_order_of_publishers(merged: Path, tmp_path:
     assert rows(other) == rows(merged)
     for line in rows(merged):
         assert (other / line["file"]).read_bytes() == (merged / line["file"]).read_bytes()
-
-
-# -- merging
-
-
-def exposed(exposure_ms: float, radiance: Any, good: Any = True) -> Exposed:
-    values = np.asarray(radiance, dtype=np.float64)
-    return Exposed(exposure_ms, values, 1.0, np.broadcast_to(good, values.shape))
-
-
-def test_merging_keeps_what_exposures_agree_on() -> None:
-    values = np.linspace(0.0, 1.2, 4 * 5 * 3).reshape(4, 5, 3)
-    found, saturated = merge([exposed(t, values) for t in (0.2, 4.0, 32.0)], camera())
-    np.testing.assert_allclose(found, values, rtol=FLOAT32, atol=1e-9)
-    assert saturated == 0.0
-
-
-def test_saturated_exposures_have_no_part() -> None:
-    good = np.zeros((2, 2, 3), dtype=bool)
-    good[0] = True
-    short = exposed(0.2, np.full((2, 2, 3), 0.7))
-    found, saturated = merge([short, exposed(4.0, np.full((2, 2, 3), 0.1), good)], camera())
-    np.testing.assert_allclose(found[1], 0.7, rtol=FLOAT32)
-    assert (found[0] < 0.2).all()
-    assert saturated == 0.0
-    found, saturated = merge(
-        [exposed(0.2, np.full((2, 2, 3), 0.7), good), exposed(4.0, np.zeros((2, 2, 3)), good)],
-        camera(),
-    )
-    np.testing.assert_allclose(found[1], 0.7, rtol=FLOAT32)  # the shortest: a lower limit
-    assert saturated == 0.5
-
-
-def test_merging_is_unbiased_and_less_noisy_than_the_best_exposure() -> None:
-    rng = np.random.default_rng(11)
-    calibrated = camera()
-    scale = np.asarray(calibrated.radiance_per_dn_per_ms)
-    truth, count = 0.02, 20_000
-    noisy, best = [], np.inf
-    for exposure_ms in (4.0, 16.0):
-        per_dn = scale / exposure_ms
-        std = np.sqrt(calibrated.pixel_variance_dn2(truth / per_dn)) * per_dn
-        noisy.append(exposed(exposure_ms, truth + std * rng.standard_normal((1, count, 3))))
-        best = min(best, float(std.max()))
-    found, _ = merge(noisy, calibrated)
-    deviation = found.std(axis=(0, 1))
-    # a deviation from 20 000 values is known to 0.5 %; 4 of these
-    assert (deviation < best * 1.02).all()
-    mean_std = deviation / count**0.5
-    assert (np.abs(found.mean(axis=(0, 1), dtype=np.float64) - truth) < 4 * mean_std).all()
 
 
 # -- between light positions

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import hashlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -25,7 +27,11 @@ from tvbrdf_fitting.published import read_parameters, read_scan
 from tvbrdf_fitting.published.database import read_database
 from tvbrdf_fitting.published.text import write_all, write_beside
 from tvbrdf_launch.errors import RunError
-from tvbrdf_launch.refit import Refit, Report, Settings, find_sources
+from tvbrdf_launch.refit import Refit, Report, Settings, find_sources, pool
+from tvbrdf_launch.refit.events import Progress
+from tvbrdf_launch.refit.settings import Plan
+from tvbrdf_launch.refit.sources import Unit
+from tvbrdf_launch.refit.stored_sources import PublishedSource
 from tvbrdf_launch.refit.writer import PART_FILE
 from tvbrdf_messages.messages import Frame, Mark, Parameters, Radiance, ScanMissing
 
@@ -222,8 +228,6 @@ def test_a_scan_that_was_stored_just_before_a_kill_is_not_stored_twice(
 
 def test_each_result_says_what_it_was_made_from_and_with(recorded: Path, tmp_path: Path) -> None:
     refit(recorded, out=tmp_path, metric="relative")
-    import hashlib
-
     digest = hashlib.sha256(recorded.read_bytes()).hexdigest()
     size = recorded.stat().st_size
     for record in results(tmp_path / "rig"):
@@ -269,9 +273,12 @@ def test_published_samples_are_fitted_as_tvbrdf_fit_does(sample: Path, tmp_path:
     for record in results(folder):
         expected = fit_scan(read_scan(sample, record["scan"]).observations())
         np.testing.assert_allclose(record["values"], expected.values, rtol=1e-12)
-        names = [Path(one["name"]).name for one in record["made_from"]["files"]]
-        assert len(names) == 4
-        assert all(f"scan{record['scan']:02d}_" in name for name in names)
+        files = record["made_from"]["files"]
+        assert len(files) == 4
+        for one in files:
+            data = (sample / "tvBrdf-data" / one["name"]).read_bytes()
+            assert f"scan{record['scan']:02d}_" in one["name"]
+            assert (one["size"], one["sha256"]) == (len(data), hashlib.sha256(data).hexdigest())
     table = read_parameters(folder / "tvBrdf-fits" / "brdf-params.txt")
     np.testing.assert_allclose(table, [r["values"] for r in results(folder)], atol=0.5000001e-6)
 
@@ -394,17 +401,32 @@ def test_a_process_that_dies_is_told(
     sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Workers are forked or spawned; a spawned one finds the same bad file and dies of it."""
-    from tvbrdf_launch.refit import pool
-
     monkeypatch.setattr(pool, "_serve", _killed)
     copied = write_sample(tmp_path / "sample09", scans=1)
     with pytest.raises(RunError, match=r"ended by signal 9: out of memory\? give fewer --jobs"):
         refit(sample, copied, out=tmp_path / "out", jobs=2)
 
 
-def _killed(end: Any, parent: int) -> None:
+def _killed(end: Any, parent: int, tasks: Any) -> None:
     end.recv()
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_what_was_found_before_an_error_is_handed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(task: Any) -> Iterator[Any]:
+        yield Progress(0.25)
+        yield Progress(0.5)
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(pool, "_events", broken)
+    task = pool.Task(0, 0, PublishedSource(Path("sample01")), Unit(), Plan("radiance", {}))
+    mine, theirs = multiprocessing.Pipe()
+    with mine, theirs:
+        pool._tell(theirs, task)
+        *events, error = mine.recv()
+    assert events == [Progress(0.25), Progress(0.5)]
+    assert isinstance(error, ZeroDivisionError)
+    assert error.__notes__ == ["while refitting sample01"]
 
 
 def test_models_that_are_kept_from_scan_to_scan_are_chosen_in_order(

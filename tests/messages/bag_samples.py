@@ -6,15 +6,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
+from tests import sample_messages
+from tests.sample_messages import START_NS, noise
 from tvbrdf_messages.bag import About, BagReader, BagWriter
 from tvbrdf_messages.codec import encode
 from tvbrdf_messages.envelope import Envelope, Header
-from tvbrdf_messages.messages import ArmState, CameraInfo, Diagnostics, Frame
+from tvbrdf_messages.messages import ArmState, Diagnostics
 from tvbrdf_messages.topics import find_topic, frame_topic, info_topic
 
-START_NS = 1_800_000_000_000_000_000
 STEP_NS = 20_000_000
 """Of the arm's states: 50 a second."""
 ATTACHMENTS = {
@@ -49,19 +48,7 @@ def arm_state(sequence: int, log_time_ns: int, incarnation: str = "one") -> Told
 
 
 def camera_info(sequence: int, log_time_ns: int, camera: str = "camera_1") -> Told:
-    info = CameraInfo(
-        camera=camera,
-        model="simulated",
-        serial=str(sequence),
-        width=64,
-        height=48,
-        bit_depth=12,
-        region_x=0,
-        region_y=0,
-        hardware_stamps=True,
-        exact_exposure=True,
-        frame_rate_hz=30.0,
-    )
+    info = sample_messages.camera_info(camera=camera, serial=str(sequence))
     sent = header(camera, sequence, log_time_ns - 500)
     return Told(log_time_ns, Envelope(info_topic(camera), sent, info))
 
@@ -69,22 +56,9 @@ def camera_info(sequence: int, log_time_ns: int, camera: str = "camera_1") -> To
 def frame(
     sequence: int, log_time_ns: int, camera: str = "camera_1", shape: tuple[int, int] = (12, 16)
 ) -> Told:
-    rng = np.random.default_rng([sequence, log_time_ns % 2**32])
-    image = rng.integers(0, 4096, (*shape, 3), dtype=np.uint16)
-    message = Frame(
-        camera=camera,
-        kind="light",
-        sample="paint",
-        scan=1,
-        sweep=0,
-        attempt=1,
-        index=sequence,
-        exposure_ms=4.0,
-        bit_depth=12,
-        region_x=0,
-        region_y=0,
-        image=image,
-    )
+    height, width = shape
+    image = noise(sequence, log_time_ns % 2**32, height=height, width=width)
+    message = sample_messages.frame(image, camera=camera, index=sequence)
     sent = header(camera, sequence, log_time_ns - 3_000_000)
     return Told(log_time_ns, Envelope(frame_topic(camera), sent, message))
 

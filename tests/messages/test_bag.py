@@ -15,7 +15,6 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from tests.messages.bag_samples import (
     ATTACHMENTS,
-    START_NS,
     Told,
     arm_state,
     as_bytes,
@@ -27,6 +26,7 @@ from tests.messages.bag_samples import (
     rig_messages,
     write,
 )
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import (
     About,
     BagDamagedError,

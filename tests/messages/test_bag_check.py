@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.messages.bag_samples import START_NS, Told, arm_state, frame, rig_messages, write
+from tests.messages.bag_samples import Told, arm_state, frame, rig_messages, write
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import BagReader, CheckReport, check_bag
 
 SECOND_NS = 10**9
@@ -61,7 +62,8 @@ def test_a_clock_that_jumps_against_the_device(tmp_path: Path, jump_s: int) -> N
         told[k] = Told(at + jump_s * SECOND_NS, envelope._replace(header=sent))
     report = check_bag(write(tmp_path / "a.mcap", told))
     assert kinds(report) == (["clock", "clock"] if jump_s < 0 else ["clock"])
-    text = f"the run's clock went on by {jump_s + 0.02:.3f} s and the device's own by 0.020 s"
+    way = f"on by {jump_s}.020 s" if jump_s > 0 else f"back by {-jump_s - 0.02:.6f} s"
+    text = f"the run's clock goes {way} and the device's own goes on by 0.020 s"
     assert any(text in problem.text for problem in report.problems)
 
 

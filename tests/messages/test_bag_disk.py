@@ -12,17 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.messages.bag_samples import (
-    START_NS,
-    Told,
-    arm_state,
-    frame,
-    plain,
-    read,
-    rig_messages,
-    write,
-)
+from tests.messages.bag_samples import Told, arm_state, frame, plain, read, rig_messages, write
 from tests.paths import ROOT
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import (
     BagError,
     BagFloorError,

@@ -7,15 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.messages.bag_samples import (
-    ATTACHMENTS,
-    START_NS,
-    arm_state,
-    plain,
-    read,
-    rig_messages,
-    write,
-)
+from tests.messages.bag_samples import ATTACHMENTS, arm_state, plain, read, rig_messages, write
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import (
     About,
     BagDamagedError,

@@ -14,7 +14,8 @@ BAG_BYTES, LIMIT_BYTES = 200_000_000, 60_000_000
 WRITE = """
 import sys, numpy as np
 from dataclasses import replace
-from tests.messages.bag_samples import START_NS, frame
+from tests.messages.bag_samples import frame
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import BagWriter
 told = [frame(k, START_NS, shape=(400, 417)) for k in range(2)]
 with BagWriter(sys.argv[1], compression="none", attachments={"calibration.yaml": b"x"}) as writer:

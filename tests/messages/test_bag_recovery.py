@@ -14,7 +14,6 @@ import pytest
 
 from tests.messages.bag_samples import (
     ATTACHMENTS,
-    START_NS,
     Told,
     arm_state,
     as_bytes,
@@ -25,6 +24,7 @@ from tests.messages.bag_samples import (
     write,
 )
 from tests.paths import ROOT
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import (
     BagDamagedError,
     BagEmptyError,
@@ -284,7 +284,8 @@ def test_what_can_not_be_recovered(tmp_path: Path) -> None:
 RECORDER = """
 import sys
 from pathlib import Path
-from tests.messages.bag_samples import START_NS, frame, arm_state
+from tests.messages.bag_samples import frame, arm_state
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import BagWriter
 with BagWriter(Path(sys.argv[1]), attachments={"calibration/rig.yaml": b"x"}) as writer:
     k = 0

@@ -11,7 +11,8 @@ import msgpack
 import pytest
 from mcap.writer import Writer
 
-from tests.messages.bag_samples import START_NS, arm_state, as_bytes, frame, header, plain, write
+from tests.messages.bag_samples import arm_state, as_bytes, frame, header, plain, write
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import (
     BagEmptyError,
     BagError,

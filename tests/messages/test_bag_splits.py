@@ -9,7 +9,6 @@ import pytest
 
 from tests.messages.bag_samples import (
     ATTACHMENTS,
-    START_NS,
     Told,
     arm_state,
     camera_info,
@@ -18,6 +17,7 @@ from tests.messages.bag_samples import (
     rig_messages,
     write,
 )
+from tests.sample_messages import START_NS
 from tvbrdf_messages.bag import BagError, BagReader, BagWriter, check_bag, merge_bags
 
 SECOND_NS = 10**9

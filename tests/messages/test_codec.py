@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.sample_messages import frame
 from tvbrdf_messages.codec import MAX_BODY_BYTES, decode, encode
 from tvbrdf_messages.envelope import Header
 from tvbrdf_messages.errors import BusError, MessageError
@@ -19,23 +20,6 @@ from tvbrdf_messages.messages import ArmState, Diagnostics, Frame, Log, Mark, Si
 from tvbrdf_messages.topics import find_topic, frame_topic, table
 
 HEADER = Header("arm", "abc", "host", "boot", 7, 1_800_000_000_000_000_001, 2, 3)
-
-
-def frame(image: np.ndarray[Any, Any]) -> Frame:
-    return Frame(
-        camera="camera_1",
-        kind="light",
-        sample="s",
-        scan=1,
-        sweep=0,
-        attempt=1,
-        index=3,
-        exposure_ms=4.0,
-        bit_depth=12,
-        region_x=0,
-        region_y=0,
-        image=image,
-    )
 
 
 def as_bytes(parts: list[Any]) -> list[bytes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,6 +12,7 @@ from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.errors import BusError, MessageError
 from tvbrdf_messages.messages import Clock, Mark, OperatorRequest
 from tvbrdf_messages.run_directory import Graph, Participant
+from tvbrdf_nodes.core.device import DeviceError
 from tvbrdf_nodes.core.inprocess import InProcessGraph
 from tvbrdf_nodes.core.node import Exit, Node, NodeContext, Outputs, Release, Reply, Send, TopicUse
 
@@ -110,17 +112,63 @@ class Teller(Node[ProbeParameters]):
         yield Send(topic="/clock", message=Clock(now_ns=self.context.clock.now_ns() + SECOND_NS))
 
 
+class Device(Probe):
+    """Holds something open from its first moment to its stop."""
+
+    all: ClassVar[list[Device]] = []
+
+    def __init__(self, context: NodeContext, parameters: ProbeParameters) -> None:
+        super().__init__(context, parameters)
+        self.file = os.fdopen(os.open(os.devnull, os.O_RDONLY))
+        self.all.append(self)
+
+    def stop(self) -> Outputs:
+        self.file.close()
+        return ()
+
+
+class Broken(Probe):
+    """Fails in one moment of its life, which is its name."""
+
+    def __init__(self, context: NodeContext, parameters: ProbeParameters) -> None:
+        super().__init__(context, parameters)
+        self.fail("made")
+
+    def fail(self, moment: str) -> None:
+        if self.context.name == moment:
+            raise DeviceError(f"it can't be {moment}")
+
+    def prepare(self) -> None:
+        self.fail("prepared")
+
+    def start(self) -> Outputs:
+        self.fail("started")
+        return ()
+
+    def stop(self) -> Outputs:
+        self.fail("stopped")
+        return ()
+
+
 @pytest.fixture(autouse=True)
 def notes() -> list[tuple[str, str, int]]:
     Probe.notes.clear()
+    Device.all.clear()
     return Probe.notes
+
+
+KINDS: dict[str, type[Node[Any]]] = {
+    "teller": Teller,
+    **dict.fromkeys(("made", "prepared", "started", "stopped"), Broken),
+    **dict.fromkeys(("device_1", "device_2", "device_3"), Device),
+}
 
 
 def graph(**nodes: dict[str, Any] | None) -> Graph:
     """Return a graph of probes with their parameters; ``None``: one that the test plays."""
     participants = []
     for name, given in nodes.items():
-        cls: type[Node[Any]] = Teller if name == "teller" else Probe
+        cls = KINDS.get(name, Probe)
         use = cls.topics(name, ProbeParameters(**(given or {})))
         participants.append(
             Participant(
@@ -274,6 +322,26 @@ def test_wrong_parameters_name_their_node() -> None:
                 ),
             )
         )
+
+
+@pytest.mark.parametrize("moment", ["made", "prepared", "started"])
+def test_when_one_node_cant_begin_the_devices_of_the_others_are_closed(moment: str) -> None:
+    nodes = graph(device_1={}, device_2={}, **{moment: {}}, device_3={})
+    with pytest.raises(DeviceError, match=f"it can't be {moment}"), InProcessGraph(nodes):
+        pass
+    expected = ["device_1", "device_2"] + ["device_3"] * (moment != "made")
+    assert [device.context.name for device in Device.all] == expected
+    assert all(device.file.closed for device in Device.all)
+
+
+def test_when_one_node_cant_be_stopped_the_others_are() -> None:
+    run = InProcessGraph(graph(device_1={}, stopped={}, device_2={})).__enter__()
+    assert not any(device.file.closed for device in Device.all)
+    with pytest.raises(DeviceError, match="it can't be stopped"):
+        run.stop()
+    assert all(device.file.closed for device in Device.all)
+    assert run.bus.ports == {}
+    run.stop()  # twice does no harm
 
 
 def test_timers_and_watchdogs_can_be_moved_and_cancelled(

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from tests.paths import CALIBRATION_FILE
+from tests.replay_bags import assert_same_radiance
 from tvbrdf_messages.bag import BagIncompleteError, BagReader, recover
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import Diagnostics, Frame, Radiance
@@ -42,16 +43,6 @@ def merged_again(graph: Graph, bags: list[Path]) -> list[Radiance]:
                             pass
         found = [e.message for e in again.published("/scan/radiance")]
     return [message for message in found if isinstance(message, Radiance)]
-
-
-def expect_same(one: Radiance, other: Radiance) -> None:
-    """Every field is the same, bit for bit."""
-    for field in Radiance.schema():
-        a, b = getattr(one, field.name), getattr(other, field.name)
-        if field.array is None:
-            assert a == b, field.name
-        else:
-            np.testing.assert_array_equal(a, b, err_msg=field.name, strict=True)
 
 
 def recorded(bag: Path, topic: str) -> list[Envelope]:
@@ -93,6 +84,9 @@ def test_a_recorded_run_can_be_merged_again(rig: Rig, small: bool) -> None:
     assert kinds == {"launch", "calibration", "scene"}
     assert scene == json.loads((rig.run / "scene.json").read_text())
     assert [stream.lost for stream in summary.streams if stream.lost] == []
+    for topic in ("/diagnostics", "/log"):  # its own too
+        told = {stream.publisher for stream in summary.streams if stream.topic == topic}
+        assert told >= {"recorder", "arm"}, topic
     image: Any = recorded(bag, "/camera_1/frame")[-1].message
     # blank: all but (0.4 + 0.1)·(0.3 + 0.1) and less than (0.3 + 0.1)·(0.08 + 0.15) of the pixels
     assert (np.count_nonzero(image.image) < 0.33 * image.image.size) == small
@@ -104,7 +98,7 @@ def test_a_recorded_run_can_be_merged_again(rig: Rig, small: bool) -> None:
     assert len(live) == len(again) == 2
     for one, other in zip(live, again, strict=True):
         assert isinstance(one, Radiance)
-        expect_same(one, other)
+        assert_same_radiance(one, other)
 
 
 def test_a_killed_recorder_loses_a_second_at_most(rig: Rig) -> None:
@@ -153,7 +147,7 @@ def test_a_killed_recorder_loses_a_second_at_most(rig: Rig) -> None:
     again = merged_again(read_graph(rig.run), [Path(second["path"])])
     assert [each.scan for each in again] == [2]
     (other,) = (m for m in live if isinstance(m, Radiance) and m.scan == 2)
-    expect_same(other, again[0])
+    assert_same_radiance(other, again[0])
 
 
 def let_no_file_grow(rig: Rig, beyond: int) -> None:

@@ -117,8 +117,10 @@ def _plain(
 ) -> Marginal:
     internal = plain.solution.internal
     posterior = Posterior(plain.problem, no_nuisances(plain.problem))
-    optimum = Optimum(posterior, internal, np.zeros(0), plain.problem.cost(internal), solve)
-    return Marginal(plain, optimum, linearised, 2 * noise_only.cost(internal))
+    cost = noise_only.cost(internal)
+    weighted = cost if plain.problem is noise_only else plain.problem.cost(internal)
+    optimum = Optimum(posterior, internal, np.zeros(0), weighted, solve)
+    return Marginal(plain, optimum, linearised, 2 * cost)
 
 
 def _explained(

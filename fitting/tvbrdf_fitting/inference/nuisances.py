@@ -237,12 +237,13 @@ def make_nuisances(
     """
     if errors is None:
         return no_nuisances(problem)
-    rows = observations.usable.any(axis=1)
+    used = observations.used_rows
+    rows = slice(None) if used.all() else used
     camera, sweep = observations.camera[rows], observations.sweep[rows]
     names: list[str] = []
     deviations: list[float] = []
     gain_of = np.full(problem.weight.shape, -1)
-    cameras, camera_index = np.unique(camera, return_inverse=True)
+    cameras = np.unique(camera)
     if errors.gain_relative_std:
         for number in cameras.tolist():
             for channel, letter in enumerate(CHANNELS):
@@ -271,7 +272,7 @@ def make_nuisances(
         gain_of=gain_of,
         offset_of=offset_of,
         tilt=tilt,
-        frame_relative=frame[camera_index] if frame.any() else None,
+        frame_relative=frame[np.searchsorted(cameras, camera)] if frame.any() else None,
     )
 
 

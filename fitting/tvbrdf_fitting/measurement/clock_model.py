@@ -4,7 +4,9 @@ A device's message carries the device's stamp and is received later: by a fixed 
 jitter that is never negative (serial lines, USB, schedulers). So of many pairs the earliest
 arrivals carry the information, and the clock's line is the lower envelope of the pairs. The fixed
 latency cannot be seen in such pairs; whoever knows it subtracts it before. It is found from round
-trips (`one_way_delay_ns`) or from sweeps in opposite directions (`.light_offset`).
+trips (`one_way_delay_ns`). What is left of it shifts the light against its motion: sweeps to and
+fro have light offsets of opposite signs, which a fit with common errors finds and reports
+(`inference.nuisances`); the latency is an offset over the light's speed.
 
 Stamps are integer nanoseconds. UTC is about 1.8e18 ns, where float64 steps by 256 ns: origins are
 subtracted as integers before any floating-point number is made.

@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..geometry import BoolArray, FloatArray, above_horizon, light_direction
 from .calibration import Calibration, CameraCalibration
@@ -113,41 +113,6 @@ def merge_on_grid(scan: ScanObservations, calibration: Calibration) -> GridRadia
     )
 
 
-def interpolate(
-    angle_deg: ArrayLike,
-    value: ArrayLike,
-    variance: ArrayLike,
-    grid_deg: ArrayLike,
-    *,
-    step_deg: float = GRID_STEP_DEG,
-) -> Interpolated:
-    """Bring samples of a curve to grid positions by local cubics.
-
-    Four-point Lagrange polynomials, centred where possible and one-sided beside a gap; a straight
-    line in stretches of fewer than four samples. Never across a gap of more than 1.5 steps (of
-    ``step_deg``, or of the samples' median distance if that is larger). Samples closer than a
-    quarter step (the light stood nearly still) are averaged first.
-
-    Parameters
-    ----------
-    angle_deg, value, variance : array_like, (n,)
-        Samples in any order, at different angles.
-    grid_deg : array_like, (m,)
-
-    Returns
-    -------
-    Interpolated
-        Variances are those of the weighted samples, taken as independent; positions beyond a
-        stretch's end, by at most one step, are extrapolated by a straight line.
-    """
-    stencils = _Stencils(
-        np.asarray(angle_deg, dtype=np.float64), np.asarray(grid_deg, dtype=np.float64), step_deg
-    )
-    return stencils.apply(
-        np.asarray(value, dtype=np.float64), np.asarray(variance, dtype=np.float64)
-    )
-
-
 def _one_sweep(
     scan: ScanObservations, rows: NDArray[np.intp], grid: FloatArray
 ) -> list[Interpolated]:
@@ -157,14 +122,14 @@ def _one_sweep(
     was clipped.
     """
     angle = scan.light_angle_deg[rows]
-    seen = _Stencils(angle, grid, GRID_STEP_DEG).bracketed
-    stencils: dict[bytes, _Stencils] = {}
+    seen = Stencils(angle, grid).bracketed
+    stencils: dict[bytes, Stencils] = {}
     channels = []
     for channel in range(3):
         valid = scan.valid[rows, channel]
         key = valid.tobytes()
         if key not in stencils:
-            stencils[key] = _Stencils(angle[valid], grid, GRID_STEP_DEG)
+            stencils[key] = Stencils(angle[valid], grid)
         used = rows[valid]
         found = stencils[key].apply(scan.radiance[used, channel], scan.variance[used, channel])
         clipped = seen & ~found.bracketed
@@ -186,22 +151,37 @@ def _average(sweeps: list[Interpolated]) -> tuple[FloatArray, FloatArray]:
     return np.where(found, weighted / safe, np.nan), np.where(found, 1.0 / safe, np.nan)
 
 
-class _Stencils:
-    """Which samples, with which weights, make the value at each grid position."""
+class Stencils:
+    """Which samples, with which weights, make the value at each grid position.
 
-    def __init__(self, angle_deg: FloatArray, grid: FloatArray, step_deg: float) -> None:
+    Four-point Lagrange polynomials, centred where possible and one-sided beside a gap; a straight
+    line in stretches of fewer than four samples. Never across a gap of more than 1.5 steps (of the
+    grid, or of the samples' median distance if that is larger). Positions beyond a stretch's end,
+    by at most one step, are extrapolated by a straight line. Samples closer than a quarter step
+    (the light stood nearly still) are averaged first.
+
+    Parameters
+    ----------
+    angle_deg
+        (n,) of the samples, in any order.
+    grid
+        (m,) positions.
+    """
+
+    def __init__(self, angle_deg: FloatArray, grid: FloatArray) -> None:
         self._order = np.argsort(angle_deg, kind="stable")
         self._size = grid.size
         self.bracketed = np.zeros(grid.size, dtype=np.bool_)
         self.extrapolated = np.zeros(grid.size, dtype=np.bool_)
         self._rows: list[tuple[BoolArray, NDArray[np.intp], FloatArray]] = []
         x = angle_deg[self._order]
-        self._group = _groups(x, _DENSE_STEPS * step_deg)
+        self._group = _groups(x, _DENSE_STEPS * GRID_STEP_DEG)
         x = self._group_mean(x)
         if x.size >= 2:
-            self._choose(x, grid, max(step_deg, float(np.median(np.diff(x)))))
+            self._choose(x, grid, max(GRID_STEP_DEG, float(np.median(np.diff(x)))))
 
     def apply(self, value: FloatArray, variance: FloatArray) -> Interpolated:
+        """Bring samples' values (n,) with independent errors of a variance (n,) to the grid."""
         y = self._group_mean(value[self._order])
         v = self._group_mean(variance[self._order])
         if self._group is not None:

@@ -15,15 +15,7 @@ import numpy as np
 from ..geometry import BoolArray, FloatArray, IntArray, light_direction
 from ..observations import Observations
 from .calibration import Calibration
-from .sweep_merge import FrameRecord, SweepObservations, sweep_observations
-
-__all__ = [
-    "FrameRecord",
-    "ScanObservations",
-    "SweepObservations",
-    "assemble_scan",
-    "sweep_observations",
-]
+from .sweep_merge import SweepObservations
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ SURFACE = "oren_nayar+torrance_sparrow"
 DUST = f"dust+{SURFACE}"
 COLOURED = f"{SURFACE}(coloured)"
 ALIASES = {"ON+TS": SURFACE, "dust": DUST}
+"""Of whole models; those of parts, which sums may use, are in their registrations."""
 
 
 def get_model(name: str, *, form: DustForm | None = None) -> ReflectanceModel:
@@ -26,9 +27,11 @@ def get_model(name: str, *, form: DustForm | None = None) -> ReflectanceModel:
     ----------
     name
         One model or a sum, ``"lambert"``, ``"oren_nayar+torrance_sparrow(coloured)"``, with options
-        in brackets; or an alias: "ON+TS", "dust". `registered()` lists the parts.
+        in brackets and parts by name or alias, ``"ON+TS(coloured)"``. ``"dust"``, or with an option
+        ``"dust(paper)"``, lies over ON+TS unless a surface is named. `registered()` lists the
+        parts.
     form
-        For the alias "dust" only: "reciprocal" (default), "paper" or "blinn"; see `models.dust`.
+        For "dust" over ON+TS only: "reciprocal" (default), "paper" or "blinn"; see `models.dust`.
 
     Raises
     ------
@@ -36,17 +39,21 @@ def get_model(name: str, *, form: DustForm | None = None) -> ReflectanceModel:
         Unknown name or option (the message lists the known ones), or a form for a model that has
         none.
     """
-    full = ALIASES.get(name, name)
+    model = _build(name)
     if form is not None:
-        if full != DUST:
+        if model.name != DUST:
             raise ValueError(f"model {name!r} has no forms; only {DUST!r} has")
-        full = DustOverSurface(OrenNayar(), TorranceSparrow(), form).name
-    return _build(full)
+        model = _build(DustOverSurface(OrenNayar(), TorranceSparrow(), form).name)
+    return model
 
 
 @cache
 def _build(name: str) -> ReflectanceModel:
-    return build(name)
+    """Return the one model that all names of it have."""
+    parts = split(name)
+    alone = len(parts) == 1 and parts[0][0].over
+    model = build(f"{name}+{SURFACE}" if alone else name)
+    return model if model.name == name else _build(model.name)
 
 
 @cache

@@ -15,12 +15,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..geometry import CHANNELS, FloatArray
+from ..geometry import CHANNELS, FloatArray, paired
+
+if TYPE_CHECKING:
+    from .lobe import Twin
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,8 @@ class ReflectanceModel(ABC):
     terms: tuple[Term, ...]
     confounded: tuple[tuple[str, str], ...] = ()
     """Pairs that data may be unable to tell apart; checked by their correlation after a fit."""
+    twins: tuple[tuple[Twin, ...], ...] = ()
+    """Lobes of one kind, kind by kind: any two of them may change places."""
     diffuse: bool = False
     """True for what scatters below a layer of dust, False for a lobe on the surface."""
     reciprocal: bool = True
@@ -288,14 +293,7 @@ class ReflectanceModel(ABC):
 
 def _directions(light: ArrayLike, view: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return directions (n, 3) with the hidden ones replaced by the normal, and a mask (n,)."""
-    lights = np.atleast_2d(np.asarray(light, dtype=np.float64))
-    views = np.atleast_2d(np.asarray(view, dtype=np.float64))
-    for name, array in (("light", lights), ("view", views)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name} directions have shape {array.shape}, expected (n, 3)")
-    if 1 not in {lights.shape[0], views.shape[0]} and lights.shape != views.shape:
-        raise ValueError(f"{lights.shape[0]} light directions but {views.shape[0]} view directions")
-    lights, views = np.broadcast_arrays(lights, views)
+    lights, views = paired(light, view)
     above = (lights[:, 2] > 0) & (views[:, 2] > 0)
     if not above.all():
         normal = np.array([0.0, 0.0, 1.0])

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..geometry import FloatArray
 from .base import Parameter, ReflectanceModel, Term
+from .lobe import Lobe, Twin
 
 
 class SumModel(ReflectanceModel):
@@ -41,6 +42,7 @@ class SumModel(ReflectanceModel):
         self.parameters = tuple(parameters)
         self.terms = tuple(terms)
         self.confounded = tuple(confounded)
+        self.twins = _twins(self.parts, self.slices)
 
     def refuse(self, light: FloatArray, view: FloatArray) -> str | None:
         """Return the first part's reason why these directions cannot determine it."""
@@ -73,6 +75,17 @@ def through(term: Term, index: int) -> Term:
         return term.vector(prepared[index], shapes, typical)
 
     return replace(term, vector=vector)
+
+
+def _twins(
+    parts: Sequence[ReflectanceModel], slices: Sequence[slice]
+) -> tuple[tuple[Twin, ...], ...]:
+    """Return the lobes of each kind, by name with its options, of which there are several."""
+    kinds: dict[str, list[Twin]] = {}
+    for part, where in zip(parts, slices, strict=True):
+        if isinstance(part, Lobe):
+            kinds.setdefault(part.name, []).append(Twin(part, where.start))
+    return tuple(tuple(twins) for twins in kinds.values() if len(twins) > 1)
 
 
 def _unique_names(part: ReflectanceModel, seen: Counter[str]) -> dict[str, str]:

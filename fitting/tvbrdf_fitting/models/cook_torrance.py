@@ -133,6 +133,10 @@ class CookTorrance(Lobe):
             lobe *= dielectric_reflectance(prepared.cos_d, prepared.cos_d_squared, *index)
         return lobe
 
+    def sharpness(self, shapes: Sequence[float]) -> float:
+        """Return -log(alpha)."""
+        return -shapes[0]
+
     def lobe_slopes(
         self, prepared: Basis, shapes: Sequence[float]
     ) -> tuple[FloatArray, Sequence[FloatArray]]:

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -103,6 +103,10 @@ class DustOverSurface(ReflectanceModel):
         self._surface = slice(0, diffuse_count + len(specular.parameters))
         self._diffuse = slice(0, diffuse_count)
         self._specular = slice(diffuse_count, self._surface.stop)
+        self.twins = tuple(
+            tuple(replace(twin, first=diffuse_count + twin.first) for twin in kind)
+            for kind in specular.twins
+        )
         blinn = form == "blinn"
         self.terms = (
             *(self._attenuated(through(term, 0)) for term in diffuse.terms),

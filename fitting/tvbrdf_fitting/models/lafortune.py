@@ -111,6 +111,10 @@ class Lafortune(Lobe):
         log_power *= exponent
         return _exp(log_power, cxy, exponent)
 
+    def sharpness(self, shapes: Sequence[float]) -> float:
+        """Return log n."""
+        return shapes[1]
+
     def lobe_slopes(
         self, prepared: Basis, shapes: Sequence[float]
     ) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,13 @@ class Lobe(ReflectanceModel):
     def lobe(self, prepared: Any, shapes: Sequence[float]) -> FloatArray:
         """Return the function (n,) at internal shape values, per unit of amplitude."""
 
+    def sharpness(self, shapes: Sequence[float]) -> float:
+        """Return how narrow the lobe is at internal shape values, to compare lobes of one kind.
+
+        To be given by every lobe that has a width.
+        """
+        return 0.0
+
     @abstractmethod
     def lobe_slopes(
         self, prepared: Any, shapes: Sequence[float]
@@ -73,6 +80,36 @@ class Lobe(ReflectanceModel):
 
     def _vector(self, prepared: Any, shapes: Sequence[float], _typical: float) -> FloatArray:
         return self.lobe(prepared, shapes)
+
+
+@dataclass(frozen=True)
+class Twin:
+    """One of several lobes of the same kind in a model.
+
+    Attributes
+    ----------
+    lobe
+        Its model.
+    first
+        Place of its first parameter among the whole model's; its amplitudes come first.
+    """
+
+    lobe: Lobe
+    first: int
+
+    @property
+    def amplitudes(self) -> slice:
+        """Places of the amplitudes."""
+        return slice(self.first, self.first + len(self.lobe.terms[0].amplitudes))
+
+    @property
+    def places(self) -> slice:
+        """Places of all parameters."""
+        return slice(self.first, self.first + len(self.lobe.parameters))
+
+    def sharpness(self, internal: FloatArray) -> float:
+        """Return how narrow the lobe is at the whole model's internal coordinates (p,)."""
+        return self.lobe.sharpness(internal[self.amplitudes.stop : self.places.stop].tolist())
 
 
 def carried_by(parameter: Parameter, amplitude: str, names: tuple[str, ...]) -> Parameter:

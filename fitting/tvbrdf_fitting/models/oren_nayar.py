@@ -150,5 +150,7 @@ def _diffuse_vector(prepared: Basis, shapes: Sequence[float], typical_kd: float)
 
 
 REGISTERED = (
-    Registration("oren_nayar", "diffuse: V-shaped Lambertian facets, full form", OrenNayar),
+    Registration(
+        "oren_nayar", "diffuse: V-shaped Lambertian facets, full form", OrenNayar, alias="ON"
+    ),
 )

@@ -94,6 +94,10 @@ class Phong(Lobe):
         exponent = exponent_of(shapes[0])
         return _scaled(np.exp(prepared.log_cosine * exponent), prepared, exponent)
 
+    def sharpness(self, shapes: Sequence[float]) -> float:
+        """Return log n."""
+        return shapes[0]
+
     def lobe_slopes(
         self, prepared: Basis, shapes: Sequence[float]
     ) -> tuple[FloatArray, tuple[FloatArray]]:

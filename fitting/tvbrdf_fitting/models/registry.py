@@ -1,7 +1,8 @@
 """Models by name. A module of this folder that has `REGISTERED` adds its models: no list to edit.
 
 A name is that of one model, with options in brackets, or a sum: ``"lambert"``,
-``"oren_nayar(short)+torrance_sparrow(coloured)"``. ``dust`` comes first and lies over the rest.
+``"oren_nayar+torrance_sparrow(coloured)"``, parts by name or alias: ``"ON+TS(coloured)"``. ``dust``
+comes first and lies over the rest.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ class Registration:
         What may stand in brackets; of each group in `exclusive` at most one.
     over
         True for a layer: `build` takes the models below as its first arguments.
+    alias
+        Another name for it.
     """
 
     name: str
@@ -41,9 +44,10 @@ class Registration:
     options: tuple[str, ...] = ()
     exclusive: tuple[tuple[str, ...], ...] = ()
     over: bool = False
+    alias: str = ""
 
 
-_PART = re.compile(r"([a-z_]+)(?:\(([a-z_, ]*)\))?")
+_PART = re.compile(r"([A-Za-z_]+)(?:\(([a-z_, ]*)\))?")
 
 
 @cache
@@ -56,8 +60,14 @@ def registered() -> dict[str, Registration]:
     return {entry.name: entry for entry in found}
 
 
+@cache
+def _by_any_name() -> dict[str, Registration]:
+    entries = registered()
+    return entries | {entry.alias: entry for entry in entries.values() if entry.alias}
+
+
 def build(name: str) -> ReflectanceModel:
-    """Return the model of a name (without aliases).
+    """Return the model of a name (without the aliases of whole models).
 
     Raises
     ------
@@ -89,7 +99,7 @@ def _single(entry: Registration, options: Sequence[str]) -> ReflectanceModel:
 
 def _part(part: str, whole: str) -> tuple[Registration, tuple[str, ...]]:
     match = _PART.fullmatch(part)
-    entry = registered().get(match[1]) if match else None
+    entry = _by_any_name().get(match[1]) if match else None
     if match is None or entry is None:
         raise ValueError(
             f"unknown model {part!r} in {whole!r}; known models: {', '.join(sorted(registered()))}"

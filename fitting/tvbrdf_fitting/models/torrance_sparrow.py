@@ -80,6 +80,10 @@ class TorranceSparrow(Lobe):
         """D G / (4 cos cos) (n,) at log(1/sigma_s)."""
         return _lobe(prepared, shapes[0])[0]
 
+    def sharpness(self, shapes: Sequence[float]) -> float:
+        """Return log(1/sigma_s)."""
+        return shapes[0]
+
     def lobe_slopes(
         self, prepared: Basis, shapes: Sequence[float]
     ) -> tuple[FloatArray, tuple[FloatArray]]:
@@ -153,5 +157,6 @@ REGISTERED = (
         "specular: Gaussian facets in V-cavities, no Fresnel factor",
         TorranceSparrow,
         options=("coloured",),
+        alias="TS",
     ),
 )

@@ -167,6 +167,10 @@ class Ward(Lobe):
         half_exponent *= -0.5
         return _lobe(prepared.factor, half_exponent, alpha_x * alpha_y)
 
+    def sharpness(self, shapes: Sequence[float]) -> float:
+        """Return -log(alpha), or that of alpha_x alpha_y."""
+        return -shapes[0] if self.isotropic else -(shapes[0] + shapes[1])
+
     def lobe_slopes(
         self, prepared: Basis, shapes: Sequence[float]
     ) -> tuple[FloatArray, Sequence[FloatArray]]:

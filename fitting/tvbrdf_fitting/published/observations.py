@@ -15,7 +15,6 @@ offsets of the light are not in it at all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -65,15 +64,16 @@ def scan_observations(scan: PublishedScan, calibration: ArrayLike | None = None)
     if constants.shape != (4, 3) or not (np.isfinite(constants) & (constants > 0)).all():
         raise ValueError("calibration: constants must be (4, 3), finite and positive")
     cameras = scan.cameras
-    counts = [len(cameras[number].radiance) for number in cameras]
-    camera = np.repeat([*cameras], counts)
-    constant = constants[camera - CAMERAS[0]]
+    counts = [len(one.radiance) for one in cameras.values()]
+    numbers = np.array([*cameras])
+    camera = np.repeat(numbers, counts)
+    constant = np.repeat(constants[numbers - CAMERAS[0]], counts, axis=0)
     light = np.concatenate([one.light_direction for one in cameras.values()])
-    views = [np.tile(one.view_direction, (len(one.radiance), 1)) for one in cameras.values()]
+    views = np.array([one.view_direction for one in cameras.values()])
     radiance = np.concatenate([one.radiance for one in cameras.values()]) / constant
     return Observations(
         light_direction=light,
-        view_direction=np.concatenate(views),
+        view_direction=np.repeat(views, counts, axis=0),
         radiance=radiance,
         variance=estimate_variance(light, camera, radiance, ROUNDING / constant),
         valid=np.ones(radiance.shape, dtype=bool),
@@ -98,52 +98,29 @@ def estimate_variance(
     radiance, rounding
         (n, 3), and the standard deviation that rounding alone has.
     """
+    from .compiled import add_differences, running_mean  # takes long
+
     angle = np.arctan2(light_direction[:, 0], light_direction[:, 2])
     smooth = np.empty_like(radiance)
-    squares, levels = [], []
+    square, level, count = np.empty(radiance.T.shape), np.empty(radiance.T.shape), 0
     for number in np.unique(camera):
         rows = np.flatnonzero(camera == number)
         rows = rows[np.argsort(angle[rows], kind="stable")]
-        smooth[rows] = _smoothed(radiance[rows])
-        for square, level in _differences(angle[rows], radiance[rows]):
-            squares.append(square)
-            levels.append(level)
-    square = np.concatenate(squares) if squares else np.empty((0, 3))
-    level = np.concatenate(levels) if levels else np.empty((0, 3))
+        sorted_angle, values = angle[rows], radiance[rows]
+        smooth[rows] = running_mean(values, _SMOOTHED)
+        if len(rows) > 3:
+            gap = _GAP_STEPS * float(_medians(np.diff(sorted_angle)))
+            count = add_differences(sorted_angle, values, gap, square, level, count)
     variance = np.empty_like(radiance)
     for channel in range(len(CHANNELS)):
         signal = np.maximum(smooth[:, channel], 0.0)
-        terms, largest = _camera_noise(square[:, channel], level[:, channel])
+        terms, largest = _camera_noise(square[channel, :count], level[channel, :count])
         # beyond what the terms were found from, as shot noise
         beyond = np.maximum(signal / largest, 1.0) if largest > 0 else 1.0
-        variance[:, channel] = np.vander(np.minimum(signal, largest), 3, increasing=True) @ terms
-        variance[:, channel] *= beyond
-        smallest = SMALLEST_RELATIVE * np.maximum(signal, np.median(signal))
-        variance[:, channel] = np.maximum(variance[:, channel], np.square(smallest))
+        found = _powers(np.minimum(signal, largest)) @ terms * beyond
+        smallest = SMALLEST_RELATIVE * np.maximum(signal, _medians(signal))
+        variance[:, channel] = np.maximum(found, np.square(smallest))
     return np.asarray(variance + np.square(rounding))
-
-
-def _differences(angle: FloatArray, values: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield squared scaled third differences (m, 3) of (n, 3) values, and their mean values."""
-    if len(angle) < 4:
-        return
-    step = np.diff(angle)
-    near = (step > 0) & (step < _GAP_STEPS * np.median(step))
-    known = near[:-2] & near[1:-1] & near[2:]
-    one, two, three = step[:-2][known], step[1:-1][known], step[2:][known]
-    first, last, all_three = one + two, two + three, one + two + three
-    # Lagrange's: 1 / product of the distances to the three others
-    weights = np.array(
-        [
-            -1 / (one * first * all_three),
-            1 / (one * two * last),
-            -1 / (first * two * three),
-            1 / (all_three * last * three),
-        ]
-    )
-    weights /= np.sqrt(np.square(weights).sum(axis=0))
-    windows = np.array([values[i : len(values) - 3 + i][known] for i in range(4)])
-    yield np.square((weights[:, :, None] * windows).sum(axis=0)), windows.mean(axis=0)
 
 
 def _camera_noise(square: FloatArray, level: FloatArray) -> tuple[FloatArray, float]:
@@ -158,8 +135,13 @@ def _camera_noise(square: FloatArray, level: FloatArray) -> tuple[FloatArray, fl
     signal = np.maximum(_bin_medians(level[order], count), 0.0)
     # a bin that is known to a tenth of itself weighs as much as any other
     weight = 1.0 / np.maximum(variance, max(1e-6 * float(variance.max()), ROUNDING**2))
-    terms, _ = nnls(np.vander(signal, 3, increasing=True) * weight[:, None], variance * weight)
+    terms, _ = nnls(_powers(signal) * weight[:, None], variance * weight)
     return np.asarray(terms), float(signal.max())
+
+
+def _powers(values: FloatArray) -> FloatArray:
+    """1, the value and its square (n, 3)."""
+    return np.stack([np.ones_like(values), values, values * values], axis=-1)
 
 
 def _bin_medians(values: FloatArray, count: int) -> FloatArray:
@@ -167,15 +149,13 @@ def _bin_medians(values: FloatArray, count: int) -> FloatArray:
     size, larger = divmod(len(values), count)
     cut = larger * (size + 1)
     blocks = (values[:cut].reshape(larger, size + 1), values[cut:].reshape(count - larger, size))
-    return np.concatenate([np.median(block, axis=1) for block in blocks])
+    return np.concatenate([_medians(block) for block in blocks])
 
 
-def _smoothed(values: FloatArray) -> FloatArray:
-    """Mean over up to five neighbours, shape kept (n, 3)."""
-    kernel = np.ones(min(_SMOOTHED, len(values)))
-    count = np.convolve(np.ones(len(values)), kernel, mode="same")
-    sums = [np.convolve(channel, kernel, mode="same") for channel in values.T]
-    return np.asarray((np.array(sums) / count).T)
+def _medians(values: FloatArray) -> FloatArray:
+    """Medians over the last axis of finite values; for few of them, quicker than numpy's own."""
+    ascending, half = np.sort(values, axis=-1), values.shape[-1] // 2
+    return np.asarray((ascending[..., half] + ascending[..., -1 - half]) / 2)
 
 
 def stored_observations(scan: StoredScan) -> tuple[Observations, CommonErrors | None]:

@@ -6,7 +6,9 @@ holds is in :mod:`.scan_file`.
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from numpy.typing import ArrayLike
 
 from .scan_file import CameraScan, read_scan_file
-from .text import PublishedFormatError
+from .text import PublishedFormatError, read_bytes
 
 if TYPE_CHECKING:
     from ..observations import Observations
@@ -65,7 +67,9 @@ def parse_scan_file_name(name: str) -> tuple[int, int] | None:
     return scan, camera
 
 
-def read_scan(path: Path | str, scan: int | None = None) -> PublishedScan:
+def read_scan(
+    path: Path | str, scan: int | None = None, *, read: Callable[[Path], bytes] = read_bytes
+) -> PublishedScan:
     """Read all cameras' files of one scan.
 
     Parameters
@@ -76,6 +80,8 @@ def read_scan(path: Path | str, scan: int | None = None) -> PublishedScan:
     scan
         Its number, from 1; may be left out for a file, and where there is one scan only. A camera
         without a file is left out.
+    read
+        Gives a file's bytes; see `read_scan_file`.
 
     Raises
     ------
@@ -89,21 +95,21 @@ def read_scan(path: Path | str, scan: int | None = None) -> PublishedScan:
             raise PublishedFormatError(path, None, f"is a file of scan {named[0]}, not of {scan}")
         if not path.is_file():
             raise PublishedFormatError(path, None, "there is no such file")
-        return _read_cameras(path.parent, named[0])
+        return _read_cameras(path.parent, named[0], read)
     if scan is None:
         numbers = list_scans(path)
         if len(numbers) != 1:
             raise PublishedFormatError(path, None, f"has {len(numbers)} scans: say which to read")
         scan = numbers[0]
-    return _read_cameras(path / DATA_FOLDER, scan)
+    return _read_cameras(path / DATA_FOLDER, scan, read)
 
 
-def _read_cameras(data_folder: Path, scan: int) -> PublishedScan:
+def _read_cameras(data_folder: Path, scan: int, read: Callable[[Path], bytes]) -> PublishedScan:
     cameras = {}
     for camera in CAMERAS:
         path = data_folder / scan_file_name(scan, camera)
-        if path.exists() or path.is_symlink():  # a link to nothing is no camera without a file
-            cameras[camera] = read_scan_file(path)
+        if os.path.lexists(path):  # a link to nothing is no camera without a file
+            cameras[camera] = read_scan_file(path, read=read)
     if not cameras:
         raise PublishedFormatError(
             data_folder, None, f"has no file of scan {scan:02d}, {scan_file_name(scan, 1)}"

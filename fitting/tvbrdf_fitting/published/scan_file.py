@@ -15,6 +15,7 @@ groups therefore reads as one with fewer light positions; the other cameras' fil
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -41,8 +42,6 @@ LARGEST_RADIANCE: Final = 1e12
 
 _KEYS: Final = ("F", "L", "V")
 _MEANING: Final = {"F": "radiance b g r", "L": "light x y z", "V": "view x y z"}
-_FRACTION: Final = np.array([100_000, 10_000, 1_000, 100, 10, 1], dtype=np.int64)
-_POWERS: Final = 10 ** np.arange(9, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +66,15 @@ class CameraScan:
     radiance: NDArray[np.float64]
 
 
-def read_scan_file(path: Path | str) -> CameraScan:
+def read_scan_file(path: Path | str, *, read: Callable[[Path], bytes] = read_bytes) -> CameraScan:
     """Read one camera's file of one scan.
+
+    Parameters
+    ----------
+    path
+        The file.
+    read
+        Gives its bytes: for callers that want these too, for example to tell their checksum.
 
     Raises
     ------
@@ -78,7 +84,7 @@ def read_scan_file(path: Path | str) -> CameraScan:
         view that changes within the file, or a truncated file.
     """
     path = Path(path)
-    data = read_bytes(path)
+    data = read(path)
     end = data.find(b"\n")
     if end < 0:
         raise PublishedFormatError(
@@ -98,52 +104,13 @@ def read_scan_file(path: Path | str) -> CameraScan:
 
 def _parse_canonical(body: bytes) -> NDArray[np.float64] | None:
     """(m, 3, 3) numbers of groups in exactly the published form; None for any other."""
-    codes = np.frombuffer(body, dtype=np.uint8)
-    fields = _canonical_fields(codes)
-    numbers = None if fields is None else _decode_numbers(codes, *fields)
-    return None if numbers is None else numbers.reshape(-1, 3, 3)
+    from .compiled import SHORTEST_GROUP, parse_groups  # takes long
 
-
-def _canonical_fields(
-    codes: NDArray[np.uint8],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
-    """Where each number begins and ends if all lines are ``F``, ``L``, ``V`` and three fields."""
-    ends = np.flatnonzero(codes <= ord(" "))
-    if ends.size == 0 or ends.size % 12 or ends[-1] != codes.size - 1:
+    if not body.endswith(b"\n"):
         return None
-    ends = ends.reshape(-1, 4)  # type: ignore[assignment]  # a line has four fields
-    keys = ends[:, 0] - 1
-    lines_are_whole = (
-        (codes[ends] == np.frombuffer(b"   \n", np.uint8)).all()
-        and keys[0] == 0
-        and (keys[1:] == ends[:-1, 3] + 1).all()
-        and (codes[keys].reshape(-1, 3) == np.frombuffer(b"FLV", np.uint8)).all()
-    )
-    return (ends[:, :3].ravel() + 1, ends[:, 1:].ravel()) if lines_are_whole else None
-
-
-def _decode_numbers(
-    codes: NDArray[np.uint8], first: NDArray[np.int64], last: NDArray[np.int64]
-) -> NDArray[np.float64] | None:
-    """Numbers with exactly 6 decimals, all at once, as integers of 1e-6; None if one is not.
-
-    Their quotient by 1e6 is rounded once, so it is the double that any correct reader gives.
-    """
-    negative = codes[first] == ord("-")
-    whole_digits = last - first - negative - 7
-    if whole_digits.min() < 1 or whole_digits.max() > _POWERS.size:
-        return None
-    fraction = codes[last[:, None] + np.arange(-6, 0)] - np.uint8(ord("0"))
-    canonical = fraction.max() <= 9 and (codes[last - 7] == ord(".")).all()
-    millionths = fraction @ _FRACTION
-    for digit in range(int(whole_digits.max())):
-        present = np.flatnonzero(whole_digits > digit)
-        values = codes[last[present] - 8 - digit] - np.uint8(ord("0"))
-        canonical = canonical and values.max() <= 9
-        millionths[present] += values * (_POWERS[digit] * 1_000_000)
-    numbers: NDArray[np.float64] = millionths / 1e6
-    np.negative(numbers, out=numbers, where=negative)  # keeps the sign of -0.000000
-    return numbers if canonical else None
+    groups = np.empty((len(body) // SHORTEST_GROUP + 1, 3, 3))
+    count = parse_groups(np.frombuffer(body, dtype=np.uint8), groups)
+    return groups[:count] if count > 0 else None
 
 
 def _parse_lines(body: bytes, path: Path) -> NDArray[np.float64]:
@@ -188,6 +155,19 @@ def _parse_lines(body: bytes, path: Path) -> NDArray[np.float64]:
 def _checked(
     exposures_ms: tuple[float, ...], groups: NDArray[np.float64], path: Path
 ) -> CameraScan:
+    from .compiled import are_sound
+
+    if not are_sound(groups, LARGEST_RADIANCE, UNIT_TOLERANCE):
+        _say_what_is_wrong(groups, path)
+    return CameraScan(
+        exposures_ms=exposures_ms,
+        light_direction=groups[:, 1].copy(),
+        view_direction=groups[0, 2].copy(),
+        radiance=groups[:, 0].copy(),
+    )
+
+
+def _say_what_is_wrong(groups: NDArray[np.float64], path: Path) -> None:
     absurd = np.abs(groups[:, 0]) > LARGEST_RADIANCE
     if absurd.any():
         group, channel = (int(index) for index in np.argwhere(absurd)[0])
@@ -220,12 +200,6 @@ def _checked(
         path,
         "changes within the file",
         f"it began as {_vector(view)}; a file belongs to one camera",
-    )
-    return CameraScan(
-        exposures_ms=exposures_ms,
-        light_direction=np.ascontiguousarray(groups[:, 1]),
-        view_direction=view.copy(),
-        radiance=np.ascontiguousarray(groups[:, 0]),
     )
 
 

@@ -49,6 +49,13 @@ VERBS = (
     doctor,
 )
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
+OUR_PACKAGES = (
+    "tvbrdf_fitting",
+    "tvbrdf_messages",
+    "tvbrdf_nodes",
+    "tvbrdf_launch",
+    "tvbrdf_rendering",
+)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -94,21 +101,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         text = _explain(error)
         if text is None:
+            error.add_note("tvbrdf: this was not foreseen; please report it with the lines above")
             raise
         sys.stderr.write(f"tvbrdf: error: {text}\n")
         return EXIT_ERROR
 
 
 def _explain(error: Exception) -> str | None:
-    """Return an expected error in one line; None for one that is a fault of this program."""
-    from tvbrdf_messages.bag.errors import BagError
-    from tvbrdf_messages.errors import BusError
+    """Return an expected error in one line; None for one that is a fault of this program.
 
-    from ..errors import LaunchError, RunError
-
-    if isinstance(error, (LaunchError, RunError, BusError, BagError)):
-        return str(error)
+    Errors of our own classes say what was wrong with what was given, and what to do. A plain
+    ``ValueError`` or ``KeyError`` may be anything: whoever calls what raises it for bad input makes
+    it one of ours.
+    """
+    kind = type(error)
+    if kind.__module__.partition(".")[0] in OUR_PACKAGES:
+        return "; ".join(" ".join(text.split()) for text in (str(error), *_notes(error)))
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror or error}"
     return None
+
+
+def _notes(error: Exception) -> list[str]:
+    return getattr(error, "__notes__", [])

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 LARGEST_WIDTH = 110
 MARKS = "* ended at a bound, ? not determined by the data, = fixed"
+OVER_MODELS = "with how far the models differ that explain the data as well as the chosen one"
 ERROR_HEADINGS = (
     ("rms_percent", "RMS/peak %"),
     ("rms_absolute", "RMS"),
@@ -60,7 +61,11 @@ def scan_lines(sample: FittedSample) -> list[str]:
     fit = scan.fit
     lines = [_title(sample) + f", scan {scan.scan}", *_data_lines(scan)]
     lines += wrapped(f"model {fit.model}, metric {fit.metric}, loss {fit.loss}")
-    lines += ["", *table(_parameter_rows(fit), left=(0, 3, 4)), "", *_error_lines(scan)]
+    rows = _parameter_rows(scan)
+    lines += ["", *table(rows, left=(0, len(rows[0]) - 2, len(rows[0]) - 1))]
+    if scan.choice is not None:
+        lines += wrapped(f"± over models: {OVER_MODELS}")
+    lines += ["", *_error_lines(scan)]
     lines += ["", *_solver_lines(fit)]
     if scan.choice is not None:
         lines += ["", *choice_lines(scan.choice)]
@@ -85,22 +90,27 @@ def _data_lines(scan: FittedScan) -> list[str]:
     )
 
 
-def _parameter_rows(fit: FitResult) -> list[list[str]]:
+def _parameter_rows(scan: FittedScan) -> list[list[str]]:
     from tvbrdf_fitting.models import get_model
 
-    rows = [["parameter", "value", "± deviation", "unit", "remark"]]
-    deviations = fit.standard_deviations
+    fit, choice = scan.fit, scan.choice
+    over = [] if choice is None else ["± over models"]
+    rows = [["parameter", "value", "± deviation", *over, "unit", "remark"]]
     for index, parameter in enumerate(get_model(fit.model).parameters):
-        value, deviation = float(fit.values[index]), float(deviations[index])
+        value, deviation = float(fit.values[index]), float(fit.standard_deviations[index])
         places = decimals(deviation, value)
         shown = f"{value:.{places}f}" if math.isfinite(value) else "-"
-        known = math.isfinite(deviation) and deviation > 0
+        spreads = [deviation] if choice is None else [deviation, choice.standard_deviations[index]]
         unit = "" if parameter.unit == "1" else parameter.unit
         remark = _remark(fit, parameter.name, value)
         rows.append(
-            [parameter.name, shown, f"{deviation:.{places}f}" if known else "-", unit, remark]
+            [parameter.name, shown, *(_spread(float(s), places) for s in spreads), unit, remark]
         )
     return rows
+
+
+def _spread(deviation: float, places: int) -> str:
+    return f"{deviation:.{places}f}" if math.isfinite(deviation) and deviation > 0 else "-"
 
 
 def decimals(deviation: float, value: float = 0.0) -> int:
@@ -232,7 +242,10 @@ def series_lines(sample: FittedSample) -> list[str]:
         which = "" if len(models) == 1 else f" (scans {', '.join(str(s.scan) for s in own)})"
         lines += wrapped(f"model {model}{which}, metric {fit.metric}, loss {fit.loss}")
         lines += ["", *table(_series_rows(own), left=()), ""]
-    lines += [MARKS, "", *table(_series_errors(sample), left=())]
+    lines += [MARKS]
+    if any(scan.choice is not None for scan in scans):
+        lines += wrapped(f"deviations {OVER_MODELS}")
+    lines += ["", *table(_series_errors(sample), left=())]
     lines += _trend_lines(sample)
     choice = scans[0].choice
     if choice is not None:
@@ -248,25 +261,32 @@ def _series_rows(scans: Sequence[FittedScan]) -> list[list[str]]:
     rows = [["scan", *(["time/min"] if timed else []), *names]]
     for scan in scans:
         time = "" if scan.time_s is None else f"{scan.time_s / 60:.2f}"
-        cells = [_cell(scan.fit, index, places[index]) for index in range(len(names))]
+        cells = [_cell(scan, index, places[index]) for index in range(len(names))]
         rows.append([str(scan.scan), *([time] if timed else []), *cells])
     return rows
 
 
 def _column_decimals(scans: Sequence[FittedScan], index: int) -> int:
-    deviations = [float(scan.fit.standard_deviations[index]) for scan in scans]
+    deviations = [_deviation(scan, index) for scan in scans]
     known = [deviation for deviation in deviations if math.isfinite(deviation) and deviation > 0]
     return decimals(median(known)) if known else 4
 
 
-def _cell(fit: FitResult, index: int, places: int) -> str:
+def _deviation(scan: FittedScan, index: int) -> float:
+    """Return a parameter's standard deviation, over the models where one was chosen."""
+    of = scan.fit if scan.choice is None else scan.choice
+    return float(of.standard_deviations[index])
+
+
+def _cell(scan: FittedScan, index: int, places: int) -> str:
+    fit = scan.fit
     name, value = fit.parameter_names[index], float(fit.values[index])
     if not math.isfinite(value):
         return "-"
     marks = "*" * (name in fit.at_bound) + "?" * (name in fit.undetermined)
     if name in fit.fixed:
         return f"{value:.{places}f}="
-    deviation = float(fit.standard_deviations[index])
+    deviation = _deviation(scan, index)
     spread = f" ± {deviation:.{places}f}" if math.isfinite(deviation) else ""
     return f"{value:.{places}f}{spread}{marks}"
 

@@ -147,7 +147,8 @@ def _figures(frame: Frame, camera: CameraCalibration | None) -> Any:
 
 def _write(out: Path, frames: list[Frame], camera: CameraCalibration | None) -> list[str]:
     """Write one camera's stills; return the paths."""
-    from ..still import merge_exposures, write_exr, write_png
+    from ..errors import RunError
+    from ..still import merge_stills, write_exr, write_png
 
     name = frames[0].camera
     files = []
@@ -156,7 +157,10 @@ def _write(out: Path, frames: list[Frame], camera: CameraCalibration | None) -> 
         write_png(path, frame)
         files.append(str(path))
     if camera is not None:
-        radiance, _ = merge_exposures(frames, camera)
+        try:
+            radiance, _ = merge_stills(frames, camera)
+        except ValueError as error:
+            raise RunError(f"{name}: {error}") from error
         path = out / f"{name}_radiance.exr"
         write_exr(path, radiance, frames)
         files.append(str(path))

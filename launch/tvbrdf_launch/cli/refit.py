@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
     sources = find_sources(arguments.inputs)
     jobs = arguments.jobs or len(os.sched_getaffinity(0))
-    with _progress() as tell:
+    with progress_bar() as tell:
         report = Refit(
             sources, arguments.out, settings, jobs=jobs, again=arguments.again, tell=tell
         ).run()
@@ -139,7 +139,7 @@ def _fixed(arguments: argparse.Namespace) -> dict[str, float]:
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[float, str], None]]:
+def progress_bar() -> Iterator[Callable[[float, str], None]]:
     """Give what shows a progress bar on a terminal, and nothing elsewhere."""
     if not sys.stderr.isatty():
         yield lambda fraction, text: None

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tvbrdf_messages.bag import BagReader
 from tvbrdf_messages.bag.about import software_version
 from tvbrdf_messages.bag.errors import BagError
+from tvbrdf_messages.bag.unfinished import Unfinished
 
 from ..errors import RunError
+from ..refit.bag_source import recorded_parameters
+from ..refit.pipeline import WRITER
 from . import foxglove, protobuf, published
 from .exr import ExrOptions, write_exr_images
 from .result import Tell, Written
-from .rig import lacks_frames, recorded_parameters, rig_for_frames, rig_for_geometry
+from .rig import lacks_frames, rig_for_frames, rig_for_geometry
 
 if TYPE_CHECKING:
     from ..refit.settings import CalibrationFile
@@ -40,6 +41,8 @@ class Report:
     written: tuple[Written, ...]
     left_out: dict[str, str]
     """Formats that were not asked for by name and could not be made, and why."""
+    removed: tuple[Path, ...] = ()
+    """What exports that were killed had left of the same folder."""
 
     def plain(self) -> dict[str, Any]:
         """Return plain values."""
@@ -47,6 +50,7 @@ class Report:
             "out": str(self.out),
             "written": [each.plain() for each in self.written],
             "left_out": self.left_out,
+            "removed": [str(each) for each in self.removed],
         }
 
 
@@ -87,23 +91,19 @@ def export_bag(
 
 def _beside(out: Path, make: Callable[[Path], Report]) -> Report:
     """Make a folder under another name and rename it; after an error nothing is left."""
-    folder = None
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-        report = make(folder)
-        folder.chmod(0o755)
-        if out.exists():
-            raise RunError(f"{out}: exists by now; choose another folder")
-        folder.rename(out)
-    except RunError as error:
-        raise RunError(str(error).replace(str(folder), str(out))) from error
+        with Unfinished(out) as place:
+            place.path.mkdir()
+            try:
+                report = make(place.path)
+            except RunError as error:
+                raise RunError(str(error).replace(str(place.path), str(out))) from error
+            if out.exists():
+                raise RunError(f"{out}: exists by now; choose another folder")
+            place.path.rename(out)
+            return replace(report, removed=place.removed)
     except OSError as error:
         raise RunError(_explained(error, out)) from error
-    finally:
-        if folder is not None and folder.exists():
-            shutil.rmtree(folder, ignore_errors=True)
-    return report
 
 
 def _explained(error: OSError, out: Path) -> str:
@@ -169,8 +169,6 @@ class _Job:
 
     def write(self, name: str, folder: Path, tell: Tell) -> Written:
         """Make one format."""
-        from ..refit.pipeline import WRITER
-
         bag = self._bag
         if name == TEXT:
             recorded = recorded_parameters(bag).get(WRITER, {})

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tvbrdf_fitting.measurement.calibration import CameraCalibration
+from tvbrdf_fitting.measurement.exposure_merge import Exposed, PixelRadiance, merge_exposures
 from tvbrdf_messages.bag import BagReader
 from tvbrdf_messages.messages import Frame
 from tvbrdf_messages.topics import frame_topic
@@ -59,16 +60,6 @@ class BlockReader:
             if place in wanted and isinstance(envelope.message, Frame):
                 found[place] = envelope.message
         return found
-
-
-class Exposed(NamedTuple):
-    """One exposure at one light position; arrays are (height, width, 3)."""
-
-    exposure_ms: float
-    radiance: NDArray[np.float64]
-    weight_scale: float
-    """By which interpolation lowers the variance: (1-u)**2 + u**2."""
-    good: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -119,13 +110,13 @@ def hdr_images(
             stamps.append(sweep.frames[index + (u > 0.5)].stamp_ns)
         frame = readers[main].frame(position)
         rows, columns = pixels[main].window(frame.image)
-        radiance, saturated = merge(exposed, camera)
+        radiance, known = merge_exposures(exposed, camera)
         yield HdrImage(
             radiance=radiance,
             light_angle_deg=at.light_angle_deg,
             exposures_ms=tuple(each.exposure_ms for each in exposed),
             stamps_ns=tuple(stamps),
-            saturated_fraction=saturated,
+            saturated_fraction=float(1.0 - known.mean()),
             left=frame.region_x + columns.start,
             upper=frame.region_y + rows.start,
         )
@@ -155,13 +146,13 @@ def _around(frames: Sequence[LitFrame], angle_deg: float) -> tuple[int, float] |
 def _exposed(
     reader: BlockReader, pixels: _Pixels, sweep: CameraSweep, index: int, u: float
 ) -> Exposed:
-    first, good = pixels.radiance(reader.frame(index))
+    first = pixels.exposed(reader.frame(index))
     exposure_ms = sweep.frames[index].exposure_ms
     if u == 0.0:
-        return Exposed(exposure_ms, first, 1.0, good)
-    second, also = pixels.radiance(reader.frame(index + 1))
-    mixed = (1.0 - u) * first + u * second
-    return Exposed(exposure_ms, mixed, (1.0 - u) ** 2 + u**2, good & also)
+        return first._replace(exposure_ms=exposure_ms)
+    second = pixels.exposed(reader.frame(index + 1))
+    mixed = (1.0 - u) * first.radiance + u * second.radiance
+    return Exposed(exposure_ms, mixed, first.good & second.good, (1.0 - u) ** 2 + u**2)
 
 
 class _Pixels:
@@ -170,9 +161,8 @@ class _Pixels:
     def __init__(
         self, camera: CameraCalibration, dark_dn: NDArray[np.float64], *, whole: bool
     ) -> None:
-        self._camera, self._dark_dn, self._whole = camera, dark_dn, whole
-        self._table = camera.response.linear_table(camera.bit_depth)
-        self._scale = np.asarray(camera.radiance_per_dn_per_ms)
+        self._camera, self._whole = camera, whole
+        self._radiance = PixelRadiance(camera, dark_dn)
 
     def window(self, image: NDArray[Any]) -> tuple[slice, slice]:
         height, width = image.shape[:2]
@@ -180,34 +170,5 @@ class _Pixels:
             return slice(0, height), slice(0, width)
         return self._camera.patch.pixels(width, height)
 
-    def radiance(self, frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        codes = frame.image[self.window(frame.image)]
-        linear = codes if codes.dtype.kind == "f" else self._table[codes]
-        signal = linear.astype(np.float64) - self._dark_dn
-        return signal * self._scale / frame.exposure_ms, codes < self._camera.saturation_dn
-
-
-def merge(
-    exposed: Sequence[Exposed], camera: CameraCalibration
-) -> tuple[NDArray[np.float32], float]:
-    """Return the mean of exposures by their inverse variances, and the fraction that is unknown.
-
-    Variances are the noise model's at one common estimate of the radiance (the exposures' mean by
-    exposure time): were they taken from each exposure's own noisy value, dark values would get too
-    much weight. What is saturated in all exposures is the shortest one's: a lower limit.
-    """
-    scale = np.asarray(camera.radiance_per_dn_per_ms)
-    light = sum(each.exposure_ms * np.where(each.good, each.radiance, 0.0) for each in exposed)
-    time_ms = sum(each.exposure_ms * each.good for each in exposed)
-    known = np.asarray(time_ms) > 0
-    expected = np.maximum(light / np.where(known, time_ms, 1.0), 0.0)
-    total, weights = np.zeros(expected.shape), np.zeros(expected.shape)
-    for each in exposed:
-        per_dn = scale / each.exposure_ms
-        variance = camera.pixel_variance_dn2(expected / per_dn) * per_dn**2 * each.weight_scale
-        weight = np.where(each.good, 1.0 / variance, 0.0)
-        total += weight * each.radiance
-        weights += weight
-    shortest = min(exposed, key=lambda each: each.exposure_ms)
-    merged = np.where(known, total / np.where(known, weights, 1.0), shortest.radiance)
-    return merged.astype(np.float32), float(1.0 - known.mean())
+    def exposed(self, frame: Frame) -> Exposed:
+        return self._radiance.exposed(frame.image[self.window(frame.image)], frame.exposure_ms)

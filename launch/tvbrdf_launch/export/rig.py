@@ -5,20 +5,22 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tvbrdf_messages.bag import BagReader
 from tvbrdf_messages.bag.errors import BagError
+from tvbrdf_nodes.player.selection import command_topic
 
 from ..errors import RunError
+from ..refit.bag_source import BagSource, recorded_parameters
+from ..refit.pipeline import MERGER
+from ..refit.settings import FRAMES, CalibrationFile, Settings
 
 if TYPE_CHECKING:
     from tvbrdf_fitting.measurement.calibration import Calibration
 
-    from ..refit.settings import CalibrationFile
 
 _FRAME_TOPIC = re.compile(r"/([a-z][a-z0-9_]*)/frame")
-_FOR_LIGHT = ("/scan/command", "/scan/sweep_result", "/arm/state")
 
 
 @dataclass(frozen=True)
@@ -39,25 +41,23 @@ def cameras_of(bag: BagReader) -> list[str]:
     return sorted(found, key=lambda name: (len(name), name))
 
 
+def topics_for_light(bag: BagReader) -> tuple[str, ...]:
+    """Return the topics that tell where the light was."""
+    return (command_topic(bag.topics()), "/scan/sweep_result", "/arm/state")
+
+
 def lacks_frames(bag: BagReader) -> str:
     """Return why a bag's frames can't be exported with the light's position; empty if they can."""
     topics = bag.topics()
     if not cameras_of(bag):
         return "has no frames (/camera_N/frame) for OpenEXR; record them, or export other formats"
-    missing = [topic for topic in _FOR_LIGHT if topic not in topics]
+    missing = [topic for topic in topics_for_light(bag) if topic not in topics]
     if missing:
         return (
             f"does not tell where the light was: {', '.join(missing)} is missing; record these "
             "topics too, or export other formats"
         )
     return ""
-
-
-def recorded_parameters(bag: BagReader) -> dict[str, dict[str, Any]]:
-    """Return the parameters of the run's nodes by short name; without a graph, none."""
-    from ..refit.bag_source import _recorded_parameters
-
-    return _recorded_parameters(bag)
 
 
 def rig_for_frames(bag: BagReader, given: CalibrationFile | None) -> Rig:
@@ -68,9 +68,6 @@ def rig_for_frames(bag: BagReader, given: CalibrationFile | None) -> Rig:
     BagError, RunError
         If there is no calibration, or none that can be used.
     """
-    from ..refit.bag_source import BagSource
-    from ..refit.settings import FRAMES, Settings
-
     plan = BagSource(bag.path).plan(Settings(start=FRAMES, calibration=given))
     if plan.calibration is None:
         raise BagError(bag.path, "has no calibration inside; give the rig's with --calibration")
@@ -101,9 +98,6 @@ def rig_for_geometry(bag: BagReader, given: CalibrationFile | None) -> Rig:
     """
     from tvbrdf_nodes.hdr_merger.calibration_source import inside
     from tvbrdf_nodes.hdr_merger.node import HdrMergerParameters
-
-    from ..refit.pipeline import MERGER
-    from ..refit.settings import CalibrationFile
 
     if given is None:
         name, data = inside(str(bag.path))

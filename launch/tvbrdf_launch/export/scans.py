@@ -26,7 +26,7 @@ from tvbrdf_messages.topics import frame_topic
 from tvbrdf_nodes.hdr_merger.sweep import SweepError, SweepKey, solve_arm, split_states
 
 from .result import Progress
-from .rig import Rig, cameras_of
+from .rig import Rig, cameras_of, topics_for_light
 
 KEPT_STATES = 20_000
 KEPT_SWEEPS = 12
@@ -114,7 +114,7 @@ class ScanBook:
 
     def scans(self) -> Iterator[Scan]:
         """Yield the whole scans in the order in which they ended; a repeated one only once."""
-        topics = ["/scan/command", "/scan/sweep_result", "/arm/state"]
+        topics = [*topics_for_light(self._bag)]
         topics += [frame_topic(name) for name in self._names]
         for log_time_ns, envelope in self._bag.messages(topics):
             self._progress.at(log_time_ns)

@@ -14,6 +14,8 @@ from tvbrdf_messages.bag.errors import BagError
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import Frame, Radiance, ScanCommand, ScanMissing, SweepResult
 from tvbrdf_messages.topics import frame_topic
+from tvbrdf_nodes.player.selection import COMMAND, TOLD_COMMAND, command_topic
+from tvbrdf_nodes.recorder.attachments import SOURCE_NAME
 
 from .events import Aside, Event, Progress, Unfinished
 from .pipeline import FITTER, MERGER, WRITER, Pipeline
@@ -23,10 +25,7 @@ from .sources import Unit
 
 GRAPH_ATTACHMENT = "launch/graph.json"
 """The run's graph: every node with the parameters that it was started with."""
-_NEEDED = ("/scan/command", "/scan/sweep_result", "/arm/state")
 _FRAME_TOPIC = re.compile(r"/([a-z][a-z0-9_]*)/frame")
-_STEPS = 200
-"""How often progress is told."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class BagSource:
             If the bag lacks what the nodes need; the text says what to give.
         """
         with BagReader(self.path) as bag:
-            recorded = _recorded_parameters(bag)
+            recorded = recorded_parameters(bag)
             fitter = settings.fitter(recorded.get(FITTER, {}))
             cameras = _cameras(bag)
             start = settings.start or (FRAMES if cameras else RADIANCE)
@@ -83,7 +82,7 @@ class BagSource:
                     else "it has no radiances either: there is nothing to refit"
                 ),
             )
-        missing = [topic for topic in _NEEDED if topic not in topics]
+        missing = [topic for topic in _needed(topics) if topic not in topics]
         if missing:
             raise BagError(
                 self.path,
@@ -105,7 +104,7 @@ class BagSource:
         """See :class:`~.sources.Source`."""
         with BagReader(self.path) as bag:
             files = [file_facts(file.path) for file in bag.summary().files]
-            recorded = _recorded_parameters(bag).get(WRITER, {})
+            recorded = recorded_parameters(bag).get(WRITER, {})
             return {
                 "sample": recorded.get("sample", ""),
                 "process": recorded.get("process", ""),
@@ -113,7 +112,7 @@ class BagSource:
                 "run": bag.about.run,
                 "recorded_with": bag.about.version,
                 "files": files,
-            }
+            } | _replay_of(bag)
 
     def hashes(self, scan: int) -> list[dict[str, Any]] | None:
         """See :class:`~.sources.Source`."""
@@ -169,7 +168,8 @@ class _Reading:
         wanted = self._frames() if self._plan.start == FRAMES else self._radiances()
         for envelope in wanted:
             self.ranges.note(envelope)
-            yield envelope
+            told = envelope.topic == TOLD_COMMAND
+            yield envelope._replace(topic=COMMAND) if told else envelope
 
     def _messages(self, topics: Iterable[str]) -> Iterator[Envelope]:
         for log_time_ns, envelope in self._bag.messages([*topics]):
@@ -192,8 +192,8 @@ class _Reading:
 
     def _frames(self) -> Iterator[Envelope]:
         cameras = self._plan.merger["cameras"]
-        topics = [*_NEEDED, "/scan/missing", *(frame_topic(camera) for camera in cameras)]
         known = {*self._bag.topics()}
+        topics = [*_needed(known), "/scan/missing", *(frame_topic(camera) for camera in cameras)]
         for envelope in self._messages([t for t in topics if t in known]):
             message = envelope.message
             if isinstance(message, (Frame, ScanCommand, SweepResult, ScanMissing)):
@@ -219,12 +219,29 @@ class _Reading:
             yield Unfinished(scan, begun.sample, begun.scan_time_s, reason)
 
 
+def _needed(topics: Iterable[str]) -> tuple[str, ...]:
+    """Return what frames can't be merged without; a replay has its commands on another topic."""
+    return (command_topic(topics), "/scan/sweep_result", "/arm/state")
+
+
 def _cameras(bag: BagReader) -> list[str]:
     names = [found[1] for topic in bag.topics() if (found := _FRAME_TOPIC.fullmatch(topic))]
     return sorted(names, key=lambda name: (len(name), name))
 
 
-def _recorded_parameters(bag: BagReader) -> dict[str, dict[str, Any]]:
+def _replay_of(bag: BagReader) -> dict[str, Any]:
+    """Return which bag was played, if it is a replay that was recorded."""
+    if SOURCE_NAME not in {one.name for one in bag.summary().attachments}:
+        return {}
+    try:
+        return {"replay_of": json.loads(bag.attachment(SOURCE_NAME))}
+    except ValueError as error:
+        raise BagError(
+            bag.path, f"its attachment {SOURCE_NAME} does not name a bag: {error}"
+        ) from error
+
+
+def recorded_parameters(bag: BagReader) -> dict[str, dict[str, Any]]:
     """Return the parameters of our nodes in the run, by short name; without a graph, none."""
     from tvbrdf_nodes.core.loading import node_class_path
 
@@ -250,6 +267,7 @@ def _merger(
     if recorded is not None:
         known = {part.name for part in fields(HdrMergerParameters)}
         found = {name: value for name, value in recorded.items() if name in known}
+        found.pop("replayed", None)  # who commanded changes nothing in what comes of it
         return {**found, "cameras": [*found.get("cameras", cameras)]}
     streams = bag.summary().streams
     arm = next((s.publisher for s in streams if s.topic == "/arm/state"), "arm")

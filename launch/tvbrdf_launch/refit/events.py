@@ -18,8 +18,6 @@ class Outcome:
     radiance: Parts = ()
     parameters: Parts = ()
     """For the database writer; empty where only fits are written."""
-    values: tuple[tuple[str, ...], tuple[float, ...]] = ((), ())
-    """Names and values of the parameters; empty if it could not be fitted."""
     problem: str = ""
     """Why it could not be fitted."""
 

@@ -32,7 +32,6 @@ class TargetReport:
     unfinished: dict[int, str] = field(default_factory=dict)
     """Scans that the source does not have whole, with the reason."""
     problems: list[str] = field(default_factory=list)
-    values: list[tuple[int, dict[str, float]]] = field(default_factory=list)
 
     def plain(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -70,15 +69,11 @@ class _Target:
     source: Source
     report: TargetReport
     folder: ResultFolder | None = None
-    parts: dict[int, float] = field(default_factory=dict)
-    """How much of each of its tasks is done."""
-    left: set[int] = field(default_factory=set)
-    """Tasks that are not done."""
+    left: dict[int, float] = field(default_factory=dict)
+    """Tasks that are not done, and how much of each is."""
+    share: float = 0.0
+    """Of one of its tasks in all that is to do."""
     failed: bool = False
-
-    @property
-    def fraction(self) -> float:
-        return sum(self.parts.values()) / len(self.parts) if self.parts else 1.0
 
 
 class Refit:
@@ -116,6 +111,7 @@ class Refit:
             for source, name in zip(sources, names, strict=True)
         ]
         self._settings, self._jobs, self._again, self._tell = settings, jobs, again, tell
+        self._fraction, self._refitted = 0.0, 0
 
     def run(self) -> Report:
         """Do it; input that can't be used is in the report, and the others are refitted.
@@ -138,7 +134,6 @@ class Refit:
         for target in self._targets:
             if target.folder is not None:
                 target.report.scans = target.folder.scans
-                target.report.values = target.folder.values()
         return Report([target.report for target in self._targets], seconds)
 
     def _open(self, stack: ExitStack) -> list[pool.Task]:
@@ -163,12 +158,13 @@ class Refit:
                 opened.append((target, plan, done, tuple(facts.get("files", ()))))
         tasks: list[pool.Task] = []
         for target, plan, done, files in opened:
-            for unit in target.source.units(self._jobs, len(opened), done, plan):
+            units = target.source.units(self._jobs, len(opened), done, plan)
+            target.share = 1.0 / (len(units) * len(opened))
+            for unit in units:
                 number, index = len(tasks), self._targets.index(target)
                 mine = replace(unit, files=files)
                 tasks.append(pool.Task(number, index, target.source, mine, plan))
-                target.parts[number] = 0.0
-                target.left.add(number)
+                target.left[number] = 0.0
         return tasks
 
     def _take(self, task: pool.Task, event: Any) -> None:
@@ -178,6 +174,7 @@ class Refit:
         if isinstance(event, Outcome):
             folder.take(event)
             target.report.refitted += 1
+            self._refitted += 1
             if event.problem:
                 target.report.problems.append(f"{target.source.path}: {event.problem}")
         elif isinstance(event, (Aside, Unfinished)):
@@ -186,14 +183,12 @@ class Refit:
             target.report.problems.append(event.text)
             target.failed = True
         elif isinstance(event, Progress):
-            target.parts[task.number] = max(target.parts[task.number], event.fraction)
-            self._progress()
+            self._progress(target, task, event.fraction)
         else:
-            target.parts[task.number] = 1.0
-            target.left.discard(task.number)
+            self._progress(target, task, 1.0)
+            del target.left[task.number]
             if not target.left:
                 self._finish(target, folder)
-            self._progress()
 
     def _finish(self, target: _Target, folder: ResultFolder) -> None:
         """Put a source's results in order once all of it is done."""
@@ -206,8 +201,8 @@ class Refit:
             )
         folder.finish(complete=not target.failed)
 
-    def _progress(self) -> None:
-        at_work = [target for target in self._targets if target.parts]
-        fraction = sum(target.fraction for target in at_work) / max(1, len(at_work))
-        scans = sum(target.report.refitted for target in at_work)
-        self._tell(fraction, f"{scans} scans")
+    def _progress(self, target: _Target, task: pool.Task, fraction: float) -> None:
+        step = max(0.0, fraction - target.left[task.number])
+        target.left[task.number] += step
+        self._fraction += step * target.share
+        self._tell(min(self._fraction, 1.0), f"{self._refitted} scans")

@@ -1,12 +1,16 @@
-"""Processes that work through shares of sources, and hand over each scan as soon as it is done."""
+"""Processes that work through shares of sources, and hand over scans soon after they are done."""
 
 from __future__ import annotations
 
+import gc
 import importlib
 import multiprocessing
 import os
 import signal
+import time
+from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -22,8 +26,10 @@ if TYPE_CHECKING:
     from .sources import Source, Unit
 
 _STOP_S = 5.0
+_TELL_S = 0.05
+"""What is found meanwhile is handed over together: waking the one who writes costs both."""
 _FOR_DATABASES = ("tvbrdf_nodes.database_writer.opening",)
-_FOR_PUBLISHED = ("scipy.optimize",)
+_FOR_PUBLISHED = ("scipy.optimize", "tvbrdf_fitting.published.compiled")
 _FOR_FRAMES = (
     "cv2",
     "tvbrdf_fitting.measurement.frame_reduction",
@@ -64,8 +70,8 @@ def work(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, Event | Done]
             for event in _events(task):
                 yield task, event
         return
-    with _Pool(min(jobs, len(tasks))) as pool:
-        yield from pool.run(tasks)
+    with _Pool(tasks, min(jobs, len(tasks))) as pool:
+        yield from pool.run()
 
 
 def _events(task: Task) -> Iterator[Event | Done]:
@@ -107,19 +113,20 @@ def _threads() -> int:
 class _Pool:
     """Forks its processes where that is safe, because compiled code takes seconds to load."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, tasks: Sequence[Task], count: int) -> None:
         method = "fork" if _threads() == 1 else "spawn"
         self._context: Any = multiprocessing.get_context(method)
         self._processes: list[Any] = []
         self._ends: list[Connection] = []
-        self._count = count
+        self._tasks, self._count = tasks, count
+        self._waiting = deque(range(len(tasks)))
 
     def __enter__(self) -> _Pool:
         try:
             for _ in range(self._count):
                 mine, theirs = self._context.Pipe()
                 process = self._context.Process(
-                    target=_serve, args=(theirs, os.getpid()), daemon=True
+                    target=_serve, args=(theirs, os.getpid(), self._tasks), daemon=True
                 )
                 process.start()
                 theirs.close()
@@ -142,31 +149,33 @@ class _Pool:
                 process.join()
             process.close()
 
-    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, Event | Done]]:
-        waiting = iter(tasks)
-        busy: dict[Connection, Task] = {}
+    def run(self) -> Iterator[tuple[Task, Event | Done]]:
+        """Yield what comes of all tasks."""
+        given: dict[Connection, deque[int]] = {end: deque() for end in self._ends}
         for end in self._ends:
-            self._give(end, waiting, busy)
-        while busy:
-            ready: list[Any] = wait([*busy])
+            self._give(end, given[end])
+        while busy := [end for end in self._ends if given[end]]:
+            ready: list[Any] = wait(busy)
             for end in ready:
-                task = busy[end]
+                task = self._tasks[given[end][0]]
                 try:
-                    event = end.recv()
+                    events = end.recv()
                 except (EOFError, OSError):
                     raise self._died(end, task) from None
-                if isinstance(event, BaseException):
-                    raise event
-                if isinstance(event, Done):
-                    del busy[end]
-                    self._give(end, waiting, busy)
-                yield task, event
+                if isinstance(events[-1], Done):
+                    given[end].popleft()
+                    self._give(end, given[end])
+                for event in events:
+                    if isinstance(event, BaseException):
+                        raise event
+                    yield task, event
 
-    def _give(self, end: Connection, waiting: Iterator[Task], busy: dict[Connection, Task]) -> None:
-        task = next(waiting, None)
-        if task is not None:
-            end.send(task)
-            busy[end] = task
+    def _give(self, end: Connection, given: deque[int]) -> None:
+        """Give a process its next task; one more while many are left, so that it never waits."""
+        while self._waiting and len(given) < 1 + (len(self._waiting) > 2 * self._count):
+            given.append(self._waiting.popleft())
+            with suppress(OSError):  # one that died is found when it is listened to
+                end.send(given[-1])
 
     def _died(self, end: Connection, task: Task) -> RunError:
         process = self._processes[self._ends.index(end)]
@@ -180,24 +189,36 @@ class _Pool:
         )
 
 
-def _serve(end: Connection, parent: int) -> None:
+def _serve(end: Connection, parent: int, tasks: Sequence[Task]) -> None:
     """Work in a process of its own, until the other end is closed or its owner is gone."""
     _die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends us in order
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    gc.freeze()  # what was loaded before stays: it need not be looked at again and again
     try:
         while True:
-            task = end.recv()
-            try:
-                for event in _events(task):
-                    end.send(event)
-            except (BrokenPipeError, ConnectionResetError):
-                return
-            except Exception as error:  # noqa: BLE001  (it is raised again over there)
-                error.add_note(f"while refitting {task.source.path}")
-                end.send(error)
+            _tell(end, tasks[end.recv()])
     except (EOFError, OSError):
         return
+
+
+def _tell(end: Connection, task: Task) -> None:
+    """Work through a task, and send what comes of it, several events at a time."""
+    events: list[Event | Done | Exception] = []
+    sent_s = time.monotonic()
+    try:
+        for event in _events(task):
+            events.append(event)
+            if time.monotonic() - sent_s >= _TELL_S:
+                end.send(events)
+                events, sent_s = [], time.monotonic()
+    except (BrokenPipeError, ConnectionResetError):
+        raise
+    except Exception as error:  # noqa: BLE001  (it is raised again over there)
+        error.add_note(f"while refitting {task.source.path}")
+        events.append(error)
+    if events:
+        end.send(events)
 
 
 def _die_with_parent(parent: int) -> None:

@@ -32,6 +32,15 @@ def file_facts(path: Path) -> dict[str, Any]:
         while block := file.read(_BLOCK):
             digest.update(block)
             size += len(block)
+    return _facts(path, size, digest)
+
+
+def content_facts(path: Path, data: bytes) -> dict[str, Any]:
+    """Return name, size and SHA-256 of a file that was read."""
+    return _facts(path, len(data), hashlib.sha256(data))
+
+
+def _facts(path: Path, size: int, digest: hashlib._Hash) -> dict[str, Any]:
     return {"name": path.name, "size": size, "sha256": digest.hexdigest()}
 
 
@@ -114,7 +123,7 @@ def outcome(
         "parameter_names": found.parameter_names,
         "values": found.values,
         "standard_deviations": found.standard_deviations,
-        "covariance": found.covariance,
+        "covariance": found.covariance.tolist(),
         "at_bound": found.at_bound,
         "undetermined": found.undetermined,
         "errors": found.errors,
@@ -133,7 +142,6 @@ def outcome(
         line=f"{_json(record)[:-1]},{settings[1:]}".encode(),
         radiance=parts_of(fitted.radiance) if with_messages else (),
         parameters=parts_of(fitted.parameters) if with_messages else (),
-        values=((), ()) if lost else (found.parameter_names, found.values),
         problem=f"scan {found.scan} can't be fitted: {found.reason.removeprefix(NOT_FITTED)}"
         if lost
         else "",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from tvbrdf_messages.messages import Mark, Radiance
 from ..errors import RunError
 from .events import Aside, Event, Problem, Progress, Unfinished
 from .pipeline import Pipeline
-from .records import file_facts, outcome, parts_of, settings_text
+from .records import content_facts, file_facts, outcome, parts_of, settings_text
 from .settings import RADIANCE, Plan, Settings
 from .sources import Unit, input_errors
 
@@ -162,16 +163,18 @@ class PublishedSource:
             "process": "" if info is None else info.process,
         }
 
-    def _files(self, scan: int) -> list[Path]:
-        from tvbrdf_fitting.published.sample import CALIBRATION_FILE
-        from tvbrdf_fitting.published.scan import CAMERAS, DATA_FOLDER, scan_file_name
-
-        files = [self.path / DATA_FOLDER / scan_file_name(scan, camera) for camera in CAMERAS]
-        return [file for file in (*files, self.path / CALIBRATION_FILE) if file.exists()]
-
     def hashes(self, scan: int) -> list[dict[str, Any]] | None:
         """See :class:`~.sources.Source`."""
-        return [file_facts(file) for file in self._files(scan)]
+        from tvbrdf_fitting.published.scan import CAMERAS, DATA_FOLDER, scan_file_name
+
+        files = (self.path / DATA_FOLDER / scan_file_name(scan, camera) for camera in CAMERAS)
+        return [*(file_facts(file) for file in files if file.exists()), *self._calibration_facts()]
+
+    def _calibration_facts(self) -> list[dict[str, Any]]:
+        from tvbrdf_fitting.published.sample import CALIBRATION_FILE
+
+        file = self.path / CALIBRATION_FILE
+        return [file_facts(file)] if file.exists() else []
 
     def units(self, jobs: int, sources: int, done: frozenset[int], plan: Plan) -> list[Unit]:
         """See :class:`~.sources.Source`."""
@@ -183,25 +186,34 @@ class PublishedSource:
         """See :class:`~.sources.Source`."""
         from tvbrdf_fitting.published import read_scan
 
-        companions = _read_companions(self.path, plan)
-        scans = sorted(unit.scans or ())
+        companions, calibration = _read_companions(self.path, plan), self._calibration_facts()
+        scans, name = sorted(unit.scans or ()), self.path.resolve().name
         facts: dict[int, list[dict[str, Any]]] = {}
         problems: list[Problem] = []
 
         def read() -> Iterator[Envelope]:
             for scan in scans:
+                files: list[dict[str, Any]] = []
                 try:
-                    published = read_scan(self.path, scan)
-                    facts[scan] = self.hashes(scan) or []
+                    published = read_scan(self.path, scan, read=partial(_read_noting, files))
                 except input_errors() as error:
                     problems.append(Problem(str(error), scan))
                     continue
-                message = _radiance(published, companions, self.path.resolve().name)
+                facts[scan] = [*files, *calibration]
+                message = _radiance(published, companions, name)
                 yield _envelope(message, scan, message.scan_start_ns)
 
-        name = self.path.resolve().name
         yield from _fit(name, read(), plan, len(scans), facts, with_messages=False)
         yield from problems
+
+
+def _read_noting(files: list[dict[str, Any]], path: Path) -> bytes:
+    """Return a file's bytes, and note its facts."""
+    from tvbrdf_fitting.published.text import read_bytes
+
+    data = read_bytes(path)
+    files.append(content_facts(path, data))
+    return data
 
 
 def _envelope(message: Radiance, scan: int, stamp_ns: int) -> Envelope:

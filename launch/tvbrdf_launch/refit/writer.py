@@ -8,6 +8,7 @@ belongs to the result once its line is whole there. ``database/`` is a database 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Mapping
@@ -199,15 +200,6 @@ class ResultFolder:
         """Scans that were begun and are not whole in the source, with the reason."""
         return {scan: one.reason for scan, one in sorted(self._unfinished.items())}
 
-    def values(self) -> list[tuple[int, dict[str, float]]]:
-        """Return each scan's fitted parameters by name, in order; what was not fitted has none."""
-        found = []
-        for scan, line in sorted(self._lines.items()):
-            record = json.loads(line)
-            pairs = zip(record["parameter_names"], record["values"], strict=True)
-            found.append((scan, {n: v for n, v in pairs if v is not None}))
-        return found
-
     def finish(self, *, complete: bool) -> None:
         """Put the results in order; they are whole when this returns."""
         if self._source.keeps_radiance and self._lines:
@@ -243,8 +235,10 @@ class ResultFolder:
         from tvbrdf_fitting.published.sample import FITS_FILE, LOST_FILE
 
         rows = {}
-        for scan, values in self.values():
-            row = parameters_row([*values], [*values.values()]) if values else None
+        for scan, line in sorted(self._lines.items()):
+            record = json.loads(line)
+            values = [math.nan if value is None else value for value in record["values"]]
+            row = parameters_row(record["parameter_names"], values)
             if row is not None:
                 rows[scan] = row
         if not rows:

@@ -52,12 +52,7 @@ class InProcessRun(Run):
         self._graph = InProcessGraph(graph, run=names)
         self._ports = {name: self._graph.bus.port(name) for name in played}
         self._stopped = False
-        try:
-            self._graph.__enter__()
-        except BaseException:
-            with contextlib.suppress(Exception):
-                self.stop()
-            raise
+        self._graph.__enter__()
         self._collect()
 
     @property
@@ -186,8 +181,7 @@ class InProcessRun(Run):
         self._stopped = True
         with contextlib.ExitStack() as last:
             last.callback(self._collect)
-            for runner in reversed(self._graph.runners.values()):
-                last.callback(_stop_one, runner)
+            last.callback(self._graph.stop)
 
     def kill(self, name: str) -> None:
         """Let a participant that the test plays vanish, as one whose process was killed."""
@@ -215,11 +209,3 @@ class InProcessRun(Run):
                 runner.state if end is None else f"has ended (code {end.code}: {end.text})"
             )
         return states | dict.fromkeys(self.played, "played by the test")
-
-
-def _stop_one(runner: Any) -> None:
-    try:
-        runner.put(runner.node.stop())
-        runner.set_state("stopping")
-    finally:
-        runner.port.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -40,7 +41,7 @@ class Told(NamedTuple):
     envelope: Envelope
 
 
-class Run:
+class Run(ABC):
     """Nodes of a graph that run, and participants that the test plays.
 
     Time goes on only while the test waits (in process), or at its own pace (real processes).
@@ -74,29 +75,30 @@ class Run:
     # -- what the two kinds of runs do in their own way
 
     @property
+    @abstractmethod
     def now_ns(self) -> int:
         """The run's time, integer nanoseconds."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def ended(self) -> Ended | None:
         """How the run ended; None as long as it goes on."""
-        raise NotImplementedError
 
+    @abstractmethod
     def stop(self) -> None:
         """Stop all nodes; again is harmless. What was published can still be asked for."""
-        raise NotImplementedError
 
+    @abstractmethod
     def ask(self, node: str, verb: str, **arguments: Any) -> OperatorReply:
         """Ask a node what a person may ask it, as ``tvbrdf scan`` does, and return its answer."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _until(self, done: Callable[[], bool], timeout_s: float) -> str:
         """Go on until ``done()``; return why it is not, or nothing if it is."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _node_states(self) -> dict[str, str]:
-        raise NotImplementedError
+        """Return how each node is, in words, for who waited in vain."""
 
     # -- waiting
 

@@ -1,7 +1,8 @@
 """Bags: what a run said, in MCAP files that other tools open too."""
 
-from .about import CALIBRATION, LAUNCH, NOTES, SCENE, About, attachment_kind
+from .about import CALIBRATION, LAUNCH, NOTES, SCENE, SOURCE, About, attachment_kind
 from .check import CheckReport, Problem, check_bag
+from .clock_jumps import ClockJump
 from .edit import EditReport, filter_bag, merge_bags
 from .errors import (
     BagDamagedError,
@@ -27,6 +28,7 @@ __all__ = [
     "LAUNCH",
     "NOTES",
     "SCENE",
+    "SOURCE",
     "About",
     "AttachmentSummary",
     "BagDamagedError",
@@ -42,6 +44,7 @@ __all__ = [
     "BagWriteError",
     "BagWriter",
     "CheckReport",
+    "ClockJump",
     "EditReport",
     "FileSummary",
     "Lost",

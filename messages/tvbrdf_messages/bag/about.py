@@ -6,13 +6,14 @@ import json
 import time
 import uuid
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from ..envelope import host_name
+from .clock_jumps import ClockJump
 from .errors import BagDamagedError, BagVersionError
 
 PROFILE = "tvbrdf"
@@ -22,6 +23,8 @@ ABOUT_RECORD, STREAMS_RECORD = "tvbrdf", "tvbrdf.streams"
 
 LAUNCH, SCENE, CALIBRATION, NOTES = "launch", "scene", "calibration", "notes"
 """First words of attachments' names, as in ``calibration/rig.yaml`` or ``notes.txt``."""
+SOURCE = "source"
+"""Of a replay that was recorded: which bag was played."""
 
 
 @cache
@@ -130,6 +133,9 @@ def _checksum(fields: Mapping[str, str]) -> int:
     return zlib.crc32(json.dumps(sorted(fields.items())).encode())
 
 
-def streams_record(streams: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the metadata record that counts messages and gaps."""
-    return sealed({"streams": json.dumps(streams)})
+def streams_record(
+    streams: list[dict[str, Any]], clock_jumps: Iterable[ClockJump]
+) -> dict[str, str]:
+    """Return the metadata record that counts messages and gaps, and tells jumps of clocks."""
+    jumps = [jump._asdict() for jump in clock_jumps]
+    return sealed({"streams": json.dumps(streams), "clock_jumps": json.dumps(jumps)})

@@ -16,6 +16,7 @@ from ..codec import decode
 from ..envelope import Header
 from ..errors import MessageError
 from .about import CALIBRATION, attachment_kind
+from .clock_jumps import ClockJumps
 from .errors import BagError
 from .index import DATA_END_BYTES, BagFile
 from .layout import bag_files
@@ -26,8 +27,6 @@ from .stored import unpack_parts
 from .streams import Stream, StreamCounts, StreamKey, join_streams
 
 MAX_PROBLEMS = 1000
-JUMP_S = 1.0
-"""A device's own clock and the run's go on together, but for drift."""
 SHOWN_GAPS = 5
 _BLOCK_BYTES = 1 << 20
 
@@ -137,8 +136,7 @@ class _Messages:
     def __init__(self, report: CheckReport, reader: BagReader) -> None:
         self.report, self.reader = report, reader
         self._counts = StreamCounts()
-        self._last: dict[StreamKey, Header] = {}
-        self._log_time_ns: int | None = None
+        self._jumps = ClockJumps()
         self._unreadable: set[tuple[str, object]] = set()
 
     def check(self) -> None:
@@ -146,6 +144,9 @@ class _Messages:
         found: list[Stream] = []
         for file in self.reader.files:
             self._file(file)
+            for jump in self._jumps.take():
+                where = f"{file.path}: {jump.topic} at {jump.log_time_ns}"
+                self.report.add("clock", f"{where}: {jump.text}")
             mine = self._counts.all()
             self._compare(file, mine)
             found += mine
@@ -183,13 +184,8 @@ class _Messages:
             return
         if (entry.publish_time_ns, channel.publisher) != (header.stamp_ns, header.publisher):
             self.report.add("message", f"{where}: stamp or publisher are not those of its header")
-        self._clock(where, entry.log_time_ns)
         key = StreamKey(channel.topic, header.publisher, header.incarnation)
-        last = self._last.get(key)
-        if last is not None:
-            self._follow(where, last, header)
-        if last is None or header.sequence > last.sequence:
-            self._last[key] = header
+        self._jumps.note(key, header, entry.log_time_ns)
         self._counts.add(
             key, channel.schema.type_name, header.sequence, entry.log_time_ns, len(data)
         )
@@ -205,26 +201,6 @@ class _Messages:
             self.report.add("message", f"{file.path}: {channel.topic}: {why}")
             return None
         return decode(unpack_parts(data)).header
-
-    def _clock(self, where: str, log_time_ns: int) -> None:
-        before = self._log_time_ns
-        if before is not None and log_time_ns < before:
-            back_s = (before - log_time_ns) / 1e9
-            self.report.add("clock", f"{where}: log time goes back by {back_s:.6f} s")
-        self._log_time_ns = log_time_ns
-
-    def _follow(self, where: str, last: Header, now: Header) -> None:
-        """Compare a message with the one before of its publisher."""
-        if now.sequence != last.sequence + 1 or not (last.hardware_ns and now.hardware_ns):
-            return
-        run_s = (now.stamp_ns - last.stamp_ns) / 1e9
-        device_s = (now.hardware_ns - last.hardware_ns) / 1e9
-        if abs(run_s - device_s) > JUMP_S:
-            self.report.add(
-                "clock",
-                f"{where}: since the message before, the run's clock went on by {run_s:.3f} s "
-                f"and the device's own by {device_s:.3f} s",
-            )
 
     def _sequence(self, stream: Stream) -> None:
         who = f"{self.reader.path}: {stream.topic} of {stream.publisher} ({stream.incarnation})"

@@ -33,6 +33,8 @@ class EditReport:
     """Of a merge: messages that had come already. Of a filter: those not selected."""
     topics: dict[str, int] = field(default_factory=dict)
     """Messages of each topic."""
+    removed: tuple[Path, ...] = ()
+    """What others that were killed had left of the same output."""
 
     def count(self, message: RawMessage) -> None:
         """Count a message that was written."""
@@ -41,7 +43,8 @@ class EditReport:
 
     def plain(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {**asdict(self), "out": str(self.out)}
+        removed = [str(each) for each in self.removed]
+        return {**asdict(self), "out": str(self.out), "removed": removed}
 
 
 def filter_bag(
@@ -79,6 +82,7 @@ def filter_bag(
             raise BagTopicError(path, f"has no topic {topic!r}; there are: {', '.join(have)}")
         chosen = [topic for topic in have if wanted(topic)]
         with NewBag(report.out, _made("filtered", reader.about, path), reader.attachments()) as bag:
+            report.removed = bag.removed
             if start_ns is not None:
                 latched = [topic for topic in chosen if _is_latched(topic)]
                 for message in reader.last_raw_before(latched, start_ns):
@@ -134,6 +138,7 @@ def merge_bags(
             about = dataclasses.replace(about, run="")
         seen: dict[tuple[str, StreamKey], _Seen] = {}
         with NewBag(report.out, about, _join_attachments(readers)) as bag:
+            report.removed = bag.removed
             for run, message in heapq.merge(
                 *(_of_run(run, reader) for run, reader in zip(runs, readers, strict=True)),
                 key=lambda pair: pair[1].log_time_ns,

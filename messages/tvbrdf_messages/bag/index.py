@@ -12,8 +12,9 @@ import json
 import os
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -30,6 +31,7 @@ from mcap.records import (
 )
 
 from .about import ABOUT_RECORD, PROFILE, STREAMS_RECORD, About, read_about, unsealed
+from .clock_jumps import ClockJump
 from .errors import (
     BagDamagedError,
     BagEmptyError,
@@ -56,6 +58,7 @@ from .streams import Stream, read_streams
 FOOTER_BYTES = RECORD_HEAD.size + 8 + 8 + 4
 DATA_END_BYTES = RECORD_HEAD.size + 4
 MAX_SUMMARY_BYTES = 1 << 30
+_T = TypeVar("_T")
 _INDEX_FIXED = struct.Struct("<QQQQI")
 _INDEX_PAIR = struct.Struct("<HQ")
 
@@ -183,12 +186,22 @@ class BagFile:
 
     def streams(self) -> list[Stream] | None:
         """Return the counts that the recorder kept; None if it kept none."""
+        return self._noticed("streams", read_streams)
+
+    def clock_jumps(self) -> list[ClockJump]:
+        """Return the jumps of clocks that the recorder noticed."""
+        found = self._noticed("clock_jumps", lambda raw: [ClockJump(**jump) for jump in raw])
+        return found or []
+
+    def _noticed(self, what: str, parse: Callable[[Any], list[_T]]) -> list[_T] | None:
+        """Return what the recorder kept of what it noticed; None if it kept nothing of that."""
         with self.path.open("rb") as stream:
             record = self.metadata(STREAMS_RECORD, stream)
         if record is None:
             return None
         try:
-            return read_streams(json.loads(unsealed(self.path, record)["streams"]))
+            fields = unsealed(self.path, record)
+            return parse(json.loads(fields[what])) if what in fields else None
         except BROKEN as error:
             raise self.damaged(f"its counts can't be read: {error}") from error
 

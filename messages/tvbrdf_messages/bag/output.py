@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +10,7 @@ from .about import About
 from .errors import BagDamagedError, BagError, BagWriteError
 from .reader import BagReader
 from .stored import RawMessage
+from .unfinished import Unfinished
 from .writer import BagWriter
 
 
@@ -40,16 +39,17 @@ class NewBag:
         self.path = path
         self._digest = _Digest()
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder = Path(tempfile.mkdtemp(prefix=f".{path.stem}.", dir=path.parent))
+            self._place = Unfinished(path)
         except OSError as error:
             raise BagWriteError(path, f"can't be made: {error.strerror}") from error
+        self.removed = self._place.removed
+        """What processes that were killed had left of the same bag."""
         try:
             self.writer = BagWriter(
-                self._folder / path.name, about=about, attachments=attachments, floor_free_bytes=0
+                self._place.path, about=about, attachments=attachments, floor_free_bytes=0
             )
         except BaseException:
-            shutil.rmtree(self._folder)
+            self._place.close()
             raise
 
     def __enter__(self) -> NewBag:
@@ -62,7 +62,7 @@ class NewBag:
             else:
                 self.writer.abandon()
         finally:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            self._place.close()
 
     def add(self, message: RawMessage) -> None:
         """Write a message."""

@@ -21,6 +21,7 @@ from .about import (
     software_version,
     streams_record,
 )
+from .clock_jumps import ClockJumps
 from .layout import media_type
 from .mcap_file import McapFile
 from .message_schema import MessageSchema
@@ -49,8 +50,8 @@ class Part(McapFile):
         What stands at its beginning, and the time that attachments get.
     compress
         See :class:`McapFile`.
-    streams
-        Counts of the files before.
+    streams, clock_jumps
+        What was noticed in the files before.
     """
 
     def __init__(
@@ -63,14 +64,15 @@ class Part(McapFile):
         time_ns: int,
         compress: bool,
         streams: StreamCounts,
+        clock_jumps: ClockJumps,
     ) -> None:
         library = f"tvbrdf {software_version()}"
         super().__init__(path, profile=PROFILE, library=library, compress=compress)
         self.start_ns: int | None = None
         """Log time of the first message put into it."""
-        self._streams = streams
+        self._streams, self._clock_jumps = streams, clock_jumps
         self._numbers: dict[tuple[str, str, MessageSchema, bool], int] = {}
-        self._pending: list[tuple[StreamKey, str, int, int, int]] = []
+        self._pending: list[tuple[StreamKey, str, Header, int, int]] = []
         try:
             self.add_metadata(ABOUT_RECORD, about_record(about, number))
             for name, data in attachments.items():
@@ -111,9 +113,7 @@ class Part(McapFile):
         self.add_message(number, message.log_time_ns, b"".join([head, *pieces]))
         if header is not None:
             key = StreamKey(message.topic, header.publisher, header.incarnation)
-            self._pending.append(
-                (key, message.schema.type_name, header.sequence, message.log_time_ns, size)
-            )
+            self._pending.append((key, message.schema.type_name, header, message.log_time_ns, size))
 
     def _channel(self, message: RawMessage) -> int:
         """Return the number of the channel: one for each topic and publisher."""
@@ -130,8 +130,9 @@ class Part(McapFile):
     def close_chunk(self) -> None:
         """Give the present chunk to the system, and count its messages."""
         super().close_chunk()
-        for counted in self._pending:
-            self._streams.add(*counted)
+        for key, type_name, header, log_time_ns, size in self._pending:
+            self._streams.add(key, type_name, header.sequence, log_time_ns, size)
+            self._clock_jumps.note(key, header, log_time_ns)
         self._pending.clear()
 
     def forget_chunk(self) -> int:
@@ -142,9 +143,9 @@ class Part(McapFile):
         return lost
 
     def finish(self) -> None:
-        """Write counts, index and end, and close; the chunk must be closed."""
+        """Write counts, jumps of clocks, index and end, and close; the chunk must be closed."""
         plain = [stream.plain() for stream in self._streams.all()]
-        self.add_metadata(STREAMS_RECORD, streams_record(plain))
+        self.add_metadata(STREAMS_RECORD, streams_record(plain, self._clock_jumps.take()))
         super().finish()
         self.close()
 

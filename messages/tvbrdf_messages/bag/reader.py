@@ -114,6 +114,7 @@ class BagReader:
             messages=sum(stream.messages for stream in streams),
             topics=topic_summaries(streams, qualities),
             streams=streams,
+            clock_jumps=tuple(jump for file in self.files for jump in file.clock_jumps()),
             attachments=tuple(
                 AttachmentSummary(index.name, index.media_type, index.data_size)
                 for _, index in sorted(self._attachments().values(), key=lambda pair: pair[1].name)

@@ -60,6 +60,8 @@ class RecoverReport:
     end_ns: int = 0
     attachments: tuple[str, ...] = ()
     lost: list[Lost] = field(default_factory=list)
+    removed: tuple[Path, ...] = ()
+    """What recoveries that were killed had left of the same output."""
 
     @property
     def lost_bytes(self) -> int:
@@ -74,6 +76,7 @@ class RecoverReport:
             "path": str(self.path),
             "out": str(self.out),
             "lost": lost,
+            "removed": [str(each) for each in self.removed],
             "lost_bytes": self.lost_bytes,
         }
 
@@ -110,6 +113,7 @@ def recover(path: str | Path, out: str | Path) -> RecoverReport:
     attachments = {name: data for f in files for name, data in f.attachments().items()}
     report = RecoverReport(path, out, attachments=tuple(sorted(attachments)))
     with NewBag(out, about, attachments) as bag:
+        report.removed = bag.removed
         for salvage in files:
             if salvage is not files[0]:
                 bag.writer.split()

@@ -78,6 +78,12 @@ class Stream:
                 return
         self.again += 1
 
+    def has(self, sequence: int) -> bool:
+        """Whether this one came already."""
+        if not self.first_sequence <= sequence <= self.last_sequence:
+            return False
+        return not any(first <= sequence <= last for first, last in self.gaps)
+
     def next_part(self) -> Stream:
         """Return the beginning of its count in the next file: what is expected is known."""
         return Stream(
@@ -108,6 +114,14 @@ class StreamCounts:
         if stream is None:
             stream = self._streams[key] = Stream(*key, type_name)
         stream.add(sequence, log_time_ns, size)
+
+    def add_new(self, key: StreamKey, sequence: int) -> bool:
+        """Count a message unless it came already; return whether it is new."""
+        stream = self._streams.get(key)
+        if stream is not None and stream.has(sequence):
+            return False
+        self.add(key, "", sequence, 0, 0)
+        return True
 
     def next_part(self) -> None:
         """Begin to count another file of the same recording."""

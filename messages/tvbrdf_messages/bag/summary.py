@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .about import About
+from .clock_jumps import ClockJump
 from .streams import Stream
 
 
@@ -66,6 +67,8 @@ class BagSummary:
     topics: tuple[TopicSummary, ...]
     streams: tuple[Stream, ...]
     """Counts and gaps of each publisher's life on each topic."""
+    clock_jumps: tuple[ClockJump, ...]
+    """As the recorder noticed them; :func:`~.check.check_bag` looks for them itself."""
     attachments: tuple[AttachmentSummary, ...]
 
     @property
@@ -83,6 +86,7 @@ class BagSummary:
         return {
             **asdict(self),
             "path": str(self.path),
+            "clock_jumps": [jump._asdict() for jump in self.clock_jumps],
             "files": [{**asdict(file), "path": str(file.path)} for file in self.files],
             "duration_s": self.duration_s,
             "size_bytes": self.size_bytes,

@@ -13,6 +13,7 @@ from ..envelope import Envelope, Header
 from ..errors import BusError, MessageError
 from ..topics import Topic, find_topic
 from .about import About
+from .clock_jumps import ClockJumps
 from .errors import BagError, BagFloorError, BagWriteError
 from .layout import Layout
 from .message_schema import schema_of
@@ -95,6 +96,7 @@ class BagWriter:
         self._latched: dict[tuple[str, str], RawMessage] = {}
         self._finished_streams: tuple[Stream, ...] = ()
         self._streams = StreamCounts()
+        self._clock_jumps = ClockJumps()
         self._last_ns = 0
         self._closed = ""
         self._finished_bytes = 0
@@ -323,6 +325,7 @@ class BagWriter:
             time_ns=self._last_ns or self.about.created_ns,
             compress=self._compress,
             streams=self._streams,
+            clock_jumps=self._clock_jumps,
         )
 
     def _open_first(self) -> Part:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..codec import decode
-from ..envelope import Envelope, Header, boot_id, host_name, new_incarnation
+from ..envelope import Envelope, Header, boot_id, host_name, in_epoch, new_incarnation
 from ..errors import MessageError
 from ..run_directory import Graph
 from ..schema import Message
@@ -47,6 +47,7 @@ class InProcessPort:
         self, bus: InProcessBus, name: str, takes: tuple[str, ...], gives: tuple[str, ...]
     ) -> None:
         self.name, self.incarnation = name, new_incarnation()
+        self._said_as = self.incarnation
         self._bus, self._takes, self._gives = bus, frozenset(takes), frozenset(gives)
         self._queue: deque[Envelope] = deque()
         self._events: list[PortEvent] = []
@@ -109,7 +110,7 @@ class InProcessPort:
         self._sequence[topic] = sequence + 1
         header = Header(
             self.name,
-            self.incarnation,
+            self._said_as,
             host_name(),
             boot_id(),
             sequence,
@@ -146,6 +147,10 @@ class InProcessPort:
             self._bus.taps.append(envelope)
         self._counters["sent"] += 1
         return delivered
+
+    def begin_epoch(self, epoch: int) -> None:
+        """See :meth:`.port.Port.begin_epoch`."""
+        self._said_as = in_epoch(self.incarnation, epoch)
 
     def release(self, topic: str, key: str) -> None:
         """See :meth:`.port.Port.release`."""

@@ -56,6 +56,10 @@ class Port(Protocol):
         """
         ...
 
+    def begin_epoch(self, epoch: int) -> None:
+        """Let what is published from now on tell the epoch of a replay, in its incarnation."""
+        ...
+
     def release(self, topic: str, key: str) -> None:
         """Forget a kept message."""
         ...

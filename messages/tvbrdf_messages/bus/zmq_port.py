@@ -87,6 +87,10 @@ class ZmqPort:
         """See :meth:`.port.Port.forward`."""
         return self.publisher.forward(list(parts))
 
+    def begin_epoch(self, epoch: int) -> None:
+        """See :meth:`.port.Port.begin_epoch`."""
+        self.publisher.begin_epoch(epoch)
+
     def release(self, topic: str, key: str) -> None:
         """See :meth:`.port.Port.release`."""
         self.publisher.release(topic, key)

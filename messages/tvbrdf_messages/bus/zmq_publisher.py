@@ -11,7 +11,7 @@ import msgpack
 import zmq
 
 from ..codec import encode, size_bytes
-from ..envelope import Header, boot_id, host_name
+from ..envelope import Header, boot_id, host_name, in_epoch
 from ..errors import MessageError, QueueFullError
 from ..run_directory import Graph
 from ..schema import Message
@@ -166,6 +166,11 @@ class ZmqPublisher:
         self.sent += 1
         self.sent_bytes += size
         return delivered
+
+    def begin_epoch(self, epoch: int) -> None:
+        """Let what is published from now on tell the epoch."""
+        name, _, host, boot = self._who
+        self._who = (name, in_epoch(self._incarnation, epoch), host, boot)
 
     def release(self, topic: str, key: str) -> None:
         """Forget a kept message."""

@@ -6,12 +6,13 @@ left to do: to the next timer, or as the world tells it.
 
 from __future__ import annotations
 
+import contextlib
 import select
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 
-from tvbrdf_messages.bus import InProcessBus, Port
+from tvbrdf_messages.bus import InProcessBus
 from tvbrdf_messages.clock import ToldClock
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.run_directory import Graph
@@ -36,26 +37,36 @@ class InProcessGraph:
         self.bus = InProcessBus(graph)
         self.bus.record = True
         self.clock = ToldClock(graph.utc_ns)
+        self._stopped = False
         names = [p.name for p in graph.participants if p.node] if run is None else list(run)
-        self.runners = {
-            name: NodeRunner(
-                graph, name, self.clock, self.bus.port(name), self._open, log_to_stderr=False
-            )
-            for name in names
-        }
+        self.runners: dict[str, NodeRunner] = {}
+        with self._stopped_on_failure():
+            for name in names:
+                port = self.bus.port(name)
+                self.runners[name] = NodeRunner(
+                    graph, name, self.clock, port, self.bus.port, log_to_stderr=False
+                )
 
-    def _open(self, name: str) -> Port:
-        return self.bus.port(name)
+    @contextlib.contextmanager
+    def _stopped_on_failure(self) -> Iterator[None]:
+        """Close what was opened if not all of it can be."""
+        try:
+            yield
+        except BaseException:
+            with contextlib.suppress(Exception):  # the first error is the one to tell
+                self.stop()
+            raise
 
     def __enter__(self) -> InProcessGraph:
-        """Start all nodes."""
-        for runner in self.runners.values():
-            runner.set_state(READY)
-            runner.node.prepare()
-        for runner in self.runners.values():
-            runner.port.events()  # of the registrations: nobody was restarted
-            runner.put(runner.node.start())
-            runner.set_state(RUNNING)
+        """Start all nodes; none stays open if one can't."""
+        with self._stopped_on_failure():
+            for runner in self.runners.values():
+                runner.set_state(READY)
+                runner.node.prepare()
+            for runner in self.runners.values():
+                runner.port.events()  # of the registrations: nobody was restarted
+                runner.put(runner.node.start())
+                runner.set_state(RUNNING)
         return self
 
     def __exit__(
@@ -65,10 +76,16 @@ class InProcessGraph:
         trace: TracebackType | None,
     ) -> None:
         """Stop all nodes."""
-        for runner in self.runners.values():
-            runner.put(runner.node.stop())
-            runner.set_state(STOPPING)
-            runner.port.close()
+        self.stop()
+
+    def stop(self) -> None:
+        """Stop all nodes, also when one of them fails to; twice does no harm."""
+        if self._stopped:
+            return
+        self._stopped = True
+        with contextlib.ExitStack() as stack:
+            for runner in reversed(self.runners.values()):
+                stack.callback(_stop, runner)
 
     def published(self, topic: str) -> list[Envelope]:
         """Return everything published on a topic so far."""
@@ -118,3 +135,11 @@ class InProcessGraph:
         if not devices and soonest is None:
             raise RuntimeError("nothing is left that could happen")
         select.select(devices, [], [], LONGEST_WAIT_S if soonest is None else soonest)
+
+
+def _stop(runner: NodeRunner) -> None:
+    with contextlib.ExitStack() as last:
+        last.callback(runner.port.close)
+        last.callback(runner.set_state, STOPPING)
+        last.callback(lambda: runner.put(runner.node.stop()))
+        last.callback(runner.take_own)

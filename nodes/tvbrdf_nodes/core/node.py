@@ -155,6 +155,8 @@ class Node(Generic[P]):
     """Whether people may ask it things (:meth:`on_request`)."""
     drains: ClassVar[bool] = False
     """Whether it takes what has arrived before it stops; nothing that moves hardware may."""
+    hears_itself: ClassVar[bool] = False
+    """Whether it takes what it says itself too, on topics that it takes from others."""
 
     def __init__(self, context: NodeContext, parameters: P) -> None:
         self.context = context

@@ -141,7 +141,7 @@ class NodeProcess:
                 wanted.append(self._service)
             if wanted != polled:
                 poller, polled = _poller(wanted), wanted
-            busy = node.pending()
+            busy = runner.pending()
             ready = dict(poller.poll(0 if busy else self._timeout_ms(next_diagnostics)))
             if self._wake in ready:
                 with contextlib.suppress(BlockingIOError):
@@ -218,13 +218,14 @@ class NodeProcess:
 
     def _end(self, code: int) -> int:
         runner = self.runner
-        try:
-            with contextlib.suppress(StoppedError):
-                runner.put(runner.node.stop())
-        except Exception as error:  # noqa: BLE001 - the rest must still be closed
-            traceback.print_exc()
-            code = code or 1
-            sys.stderr.write(f"{runner.name}: while stopping: {error}\n")
+        for last in (runner.take_own, lambda: runner.put(runner.node.stop())):
+            try:
+                with contextlib.suppress(StoppedError):
+                    last()
+            except Exception as error:  # noqa: BLE001 - the rest must still be closed
+                traceback.print_exc()
+                code = code or 1
+                sys.stderr.write(f"{runner.name}: while stopping: {error}\n")
         with contextlib.suppress(Exception):
             runner.set_state(STOPPING)
             self._serve()

@@ -11,10 +11,11 @@ from typing import Any
 
 from tvbrdf_messages.bus import Port
 from tvbrdf_messages.clock import RunClock, ToldClock
-from tvbrdf_messages.envelope import epoch_of
+from tvbrdf_messages.envelope import Envelope, Header, boot_id, epoch_of, host_name, in_epoch
 from tvbrdf_messages.errors import BusError
 from tvbrdf_messages.messages import Clock, Diagnostics, Log
 from tvbrdf_messages.run_directory import Graph
+from tvbrdf_messages.schema import Message
 from tvbrdf_messages.topics import LOSSLESS, find_topic
 
 from .loading import load_class
@@ -45,11 +46,7 @@ class _Log:
             stamp = time.strftime("%H:%M:%S", time.gmtime(runner.clock.now_ns() // 1_000_000_000))
             sys.stderr.write(f"{stamp} {level:7} {runner.name}: {text}\n")
         if "/log" in runner.gives:
-            runner.port.publish(
-                "/log",
-                Log(node=runner.name, level=level, text=text),
-                stamp_ns=runner.clock.now_ns(),
-            )
+            runner.publish("/log", Log(node=runner.name, level=level, text=text))
 
 
 class NodeRunner:
@@ -84,6 +81,8 @@ class NodeRunner:
         self.log_to_stderr = log_to_stderr
         me = graph.find(name)
         self.gives, self.live = frozenset(me.gives), me.live
+        self._own: list[Envelope] = []
+        """What the node has said itself and is yet to hear."""
         self.log: Logger = _Log(self)
         self.state, self.state_text = WAITING, ""
         self.exit: Exit | None = None
@@ -93,6 +92,7 @@ class NodeRunner:
         self._timers: dict[str, int] = {}
         self._watchdogs: dict[str, float] = {}
         node_class: type[Node[Any]] = load_class(me.node)
+        self._heard = frozenset(me.takes) & self.gives if node_class.hears_itself else frozenset()
         try:
             parameters = build(node_class.parameters_type, me.parameters)
         except ParameterError as error:
@@ -146,6 +146,7 @@ class NodeRunner:
 
     def take_messages(self, limit: int = 64) -> bool:
         """Hand arrived messages and events to the node; say whether there were any."""
+        own = self.take_own()
         found = self.port.receive(limit)
         events = self.port.events()  # first: what a restarted node sends comes after its return
         for event in events:
@@ -165,12 +166,30 @@ class NodeRunner:
                 continue
             self._note_epoch(epoch_of(envelope.header.incarnation))
             self.put(self.node.handle(envelope))
-        return bool(found or events)
+        return bool(own or found or events)
+
+    def pending(self) -> bool:
+        """Return whether the node has something to do at once."""
+        return bool(self._own) or self.node.pending()
+
+    def take_own(self) -> bool:
+        """Hand the node what it has said itself, if it hears that; say whether there was any.
+
+        Not while it speaks: so what it says about that comes behind, and can't go round in it.
+        """
+        own, self._own = self._own, []
+        for envelope in own:
+            self.put(self.node.handle(envelope))
+        return bool(own)
 
     def _note_epoch(self, epoch: int) -> None:
-        """Tell the node of a replay's jump before the first message that was sent after it."""
+        """Tell the node of a replay's jump before the first message that was sent after it.
+
+        What the node says from then on tells it to the nodes behind it.
+        """
         if epoch > self._epoch:
             self._epoch = epoch
+            self.port.begin_epoch(epoch)
             self.put(self.node.on_epoch(epoch))
 
     def put(self, outputs: Outputs) -> None:
@@ -190,16 +209,39 @@ class NodeRunner:
     def _publish(self, send: Send) -> None:
         if isinstance(send.message, Clock) and isinstance(self.clock, ToldClock):
             self.clock.tell(send.message.now_ns, send.message.epoch)  # its owner lives by it too
-        delivered = self.port.publish(
-            send.topic,
-            send.message,
-            stamp_ns=self.clock.now_ns() if send.stamp_ns is None else send.stamp_ns,
-            received_ns=send.received_ns,
-            hardware_ns=send.hardware_ns,
-            keep=send.keep,
-        )
+        stamp_ns = self.clock.now_ns() if send.stamp_ns is None else send.stamp_ns
+        stamps = (stamp_ns, send.received_ns, send.hardware_ns)
+        delivered = self.publish(send.topic, send.message, stamps, send.keep)
         if not delivered and self.live and find_topic(send.topic).quality == LOSSLESS:
             self.put(self.node.on_overflow(send.topic))
+
+    def publish(
+        self,
+        topic: str,
+        message: Message,
+        stamps: tuple[int, int, int] | None = None,
+        keep: str = "",
+    ) -> bool:
+        """Publish a message; the bus brings nobody what he says himself, so that is kept here.
+
+        ``stamps``: stamp, received and hardware, ns; the first is now when they are not given.
+        """
+        stamps = stamps or (self.clock.now_ns(), 0, 0)
+        sequence = self.port.next_sequence(topic)
+        stamp_ns, received_ns, hardware_ns = stamps
+        delivered = self.port.publish(
+            topic,
+            message,
+            stamp_ns=stamp_ns,
+            received_ns=received_ns,
+            hardware_ns=hardware_ns,
+            keep=keep,
+        )
+        if topic in self._heard:
+            life = in_epoch(self.incarnation, self._epoch) if self._epoch else self.incarnation
+            header = Header(self.name, life, host_name(), boot_id(), sequence, *stamps)
+            self._own.append(Envelope(topic, header, message))
+        return delivered
 
     def set_state(self, state: str, text: str = "") -> None:
         """Change the node's state and tell it."""
@@ -210,7 +252,7 @@ class NodeRunner:
         """Publish how the node is."""
         if "/diagnostics" not in self.gives:
             return
-        self.port.publish(
+        self.publish(
             "/diagnostics",
             Diagnostics(
                 node=self.name,
@@ -220,7 +262,6 @@ class NodeRunner:
                 counters={**self.port.counters(), **self.node.diagnostics()},
                 resident_mb=resident_mb(),
             ),
-            stamp_ns=self.clock.now_ns(),
         )
 
 

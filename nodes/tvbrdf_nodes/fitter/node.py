@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
-from tvbrdf_messages.envelope import Envelope
+from tvbrdf_messages.envelope import Envelope, epoch_of
 from tvbrdf_messages.messages import Parameters, Radiance, Stored
 
 from ..core.device import DeviceError
@@ -70,6 +70,8 @@ class FitterNode(Node[FitterParameters]):
         _check(parameters)
         self._kept: dict[str, str] = {}
         """The model chosen for a sample's last scan."""
+        self._epoch = 0
+        """Of that scan."""
         self._unstored: set[tuple[int, int]] = set()
         """Scan and attempt of parameters that were sent and are not stored yet."""
 
@@ -90,11 +92,6 @@ class FitterNode(Node[FitterParameters]):
         if self.parameters.model == AUTO:
             import tvbrdf_fitting.choice.choose  # noqa: F401
 
-    def on_epoch(self, epoch: int) -> Outputs:
-        """Forget the model of the scan before: a replay has jumped, and begins anew."""
-        self._kept.clear()
-        return ()
-
     def handle(self, envelope: Envelope) -> Outputs:
         """Fit a scan; forget one that is stored.
 
@@ -105,11 +102,21 @@ class FitterNode(Node[FitterParameters]):
             key = (message.scan, message.attempt)
             if key not in self._unstored:
                 self._unstored.add(key)
+                self._note_epoch(epoch_of(envelope.header.incarnation))
                 fitted = self._fit(message)
                 yield Send(topic="/scan/parameters", message=fitted, keep=str(message.scan))
         elif isinstance(message, Stored) and message.what == "parameters":
             self._unstored = {key for key in self._unstored if key[0] != message.scan}
             yield Release("/scan/parameters", str(message.scan))
+
+    def _note_epoch(self, epoch: int) -> None:
+        """Forget the model of the scan before if a replay has jumped, and begins anew.
+
+        By the scan's own word: the database's may be here before the merger's last one of before.
+        """
+        if epoch != self._epoch:
+            self._epoch = epoch
+            self._kept.clear()
 
     def _fit(self, radiance: Radiance) -> Parameters:
         from tvbrdf_fitting.inference.nuisances import CommonErrors

@@ -7,6 +7,7 @@ how it arrived. So a refit of what was recorded equals the live run.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from .sweep import (
     Sweep,
     SweepError,
     SweepKey,
+    check_arrived,
     check_complete,
     solve_sweep,
     split_states,
@@ -30,11 +32,8 @@ from .sweep import (
 if TYPE_CHECKING:
     from tvbrdf_fitting.measurement.calibration import Calibration
     from tvbrdf_fitting.measurement.frame_reduction import FrameReducer
-    from tvbrdf_fitting.measurement.scan_merge import (
-        FrameRecord,
-        ScanObservations,
-        SweepObservations,
-    )
+    from tvbrdf_fitting.measurement.scan_merge import ScanObservations
+    from tvbrdf_fitting.measurement.sweep_merge import FrameRecord, SweepObservations
 
 KEPT_STATES = 20_000
 """Of the arm since its last sweep: those of a sweep of six minutes."""
@@ -77,10 +76,12 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         self._states: list[Envelope] = []
         self._commands: dict[SweepKey, ScanCommand] = {}
         self._dark: dict[tuple[int, int], list[tuple[tuple[Any, ...], FrameRecord]]] = {}
+        self._dark_sent: dict[tuple[int, int], dict[str, int]] = {}
+        """How many each camera has sent, as it says when it has."""
         self._done: dict[int, dict[int, tuple[SweepObservations, dict[str, Any]]]] = {}
         """Good sweeps of each scan that is under way."""
         self._unstored: dict[int, set[str]] = {}
-        self._frames = 0
+        self._frames = self._lost = 0
         self._refused: SweepKey | None = None
 
     @classmethod
@@ -123,7 +124,8 @@ class HdrMergerNode(Node[HdrMergerParameters]):
 
     def on_epoch(self, epoch: int) -> Outputs:
         """Empty all buffers: a replay has jumped."""
-        for buffer in (self._sweeps, self._states, self._commands, self._dark, self._done):
+        buffers = (self._sweeps, self._commands, self._dark, self._dark_sent, self._done)
+        for buffer in (self._states, *buffers):
             buffer.clear()
         self._refused = None
         return ()
@@ -166,7 +168,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             return
         self._frames += 1
         if frame.kind == "dark":
-            from tvbrdf_fitting.measurement.scan_merge import FrameRecord
+            from tvbrdf_fitting.measurement.sweep_merge import FrameRecord
 
             record = FrameRecord(
                 number, -1, frame.exposure_ms, header.stamp_ns, statistics, lamp_on=False
@@ -193,7 +195,13 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         return sweep
 
     def _take_result(self, envelope: Envelope, result: SweepResult) -> Outputs:
-        if result.action != "sweep" or result.state != "done":
+        if result.state != "done" or result.action not in ("sweep", "dark"):
+            return
+        if result.action == "dark":
+            if result.source in self._numbers:
+                sent = self._dark_sent.setdefault((result.scan, result.attempt), {})
+                sent[result.source] = result.frames
+                _keep_last(self._dark_sent, KEPT_SWEEPS)
             return
         if result.source != self.parameters.arm and result.source not in self._numbers:
             return
@@ -221,6 +229,8 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         )
         try:
             check_complete(sweep, self._numbers)
+            if number == 0:
+                self._check_dark(scan)  # they are taken before it, and with it again
             found = solve_sweep(
                 sweep,
                 key,
@@ -231,6 +241,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
                 correct_motion_blur=self.parameters.correct_motion_blur,
             )
         except SweepError as error:
+            self._lost += error.lost
             yield self._result(key, "broken", str(error))
             return
         done = self._done.setdefault(scan, {})
@@ -245,6 +256,15 @@ class HdrMergerNode(Node[HdrMergerParameters]):
             yield self._result(key, "broken", f"sweeps {missing} of the scan were lost here")
             return
         yield self._result(key, "done")
+
+    def _check_dark(self, scan: int) -> None:
+        """Refuse a scan's first sweep if dark frames of the last attempt at them are missing."""
+        attempts = [key for key in self._dark_sent if key[0] == scan]
+        if attempts:
+            last = max(attempts)
+            arrived = Counter(order[0] for order, _ in self._dark.get(last, ()))
+            got = {name: arrived[number] for name, number in self._numbers.items()}
+            check_arrived(self._dark_sent[last], got, "dark frames")
 
     def _dark_frames(self, scan: int) -> list[FrameRecord]:
         """Return the dark frames of the scan's last attempt at them, in a fixed order."""
@@ -305,6 +325,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         self._sweeps = {key: value for key, value in self._sweeps.items() if key[0] > scan}
         self._commands = {key: value for key, value in self._commands.items() if key[0] > scan}
         self._dark = {key: value for key, value in self._dark.items() if key[0] > scan}
+        self._dark_sent = {key: n for key, n in self._dark_sent.items() if key[0] > scan}
         self._done = {key: value for key, value in self._done.items() if key > scan}
 
     def _take_stored(self, stored: Stored) -> Outputs:
@@ -338,6 +359,7 @@ class HdrMergerNode(Node[HdrMergerParameters]):
         """See :class:`~tvbrdf_nodes.core.node.Node`."""
         return {
             "frames": self._frames,
+            "frames_lost": self._lost,
             "unstored": len(self._unstored),
             "open_sweeps": len(self._sweeps),
             "kept_states": len(self._states),

@@ -12,7 +12,7 @@ from tvbrdf_messages.messages import ArmState, SweepResult
 if TYPE_CHECKING:
     from tvbrdf_fitting.measurement.calibration import Calibration
     from tvbrdf_fitting.measurement.frame_reduction import PatchStatistics
-    from tvbrdf_fitting.measurement.scan_merge import FrameRecord, SweepObservations
+    from tvbrdf_fitting.measurement.sweep_merge import FrameRecord, SweepObservations
 
 SweepKey = tuple[int, int, int]
 """Scan, sweep, attempt."""
@@ -42,15 +42,29 @@ class Sweep:
 class SweepError(ValueError):
     """A sweep that can't be used; the text says why, and it is taken again."""
 
+    def __init__(self, text: str, lost: int = 0) -> None:
+        super().__init__(text)
+        self.lost = lost
+        """Frames that were sent and have not arrived."""
+
 
 def check_complete(sweep: Sweep, cameras: Mapping[str, int]) -> None:
     """Refuse a sweep of which frames are missing here."""
-    for name, number in cameras.items():
-        result, got = sweep.results[name], len(sweep.frames.get(number, ()))
-        if result.frames == 0:
+    for name in cameras:
+        if sweep.results[name].frames == 0:
             raise SweepError(f"{name} saw no frame")
-        if got != result.frames:
-            raise SweepError(f"{name} sent {result.frames} frames, {got} arrived")
+    sent = {name: sweep.results[name].frames for name in cameras}
+    got = {name: len(sweep.frames.get(number, ())) for name, number in cameras.items()}
+    check_arrived(sent, got, "frames")
+
+
+def check_arrived(sent: Mapping[str, int], got: Mapping[str, int], what: str) -> None:
+    """Refuse a sweep for which another number of frames has arrived than cameras have sent."""
+    wrong = [name for name in sent if got.get(name, 0) != sent[name]]
+    if wrong:
+        texts = (f"{name} sent {sent[name]} {what}, {got.get(name, 0)} arrived" for name in wrong)
+        lost = sum(max(0, sent[name] - got.get(name, 0)) for name in wrong)
+        raise SweepError("; ".join(texts), lost)
 
 
 def split_states(
@@ -113,7 +127,7 @@ def solve_sweep(
     """Return a sweep's calibrated observations, and what was found about its clocks."""
     from tvbrdf_fitting.measurement.clock_model import ClockError, frame_stamps
     from tvbrdf_fitting.measurement.motion_blur import without_motion_blur
-    from tvbrdf_fitting.measurement.scan_merge import FrameRecord, sweep_observations
+    from tvbrdf_fitting.measurement.sweep_merge import FrameRecord, sweep_observations
 
     path, arm_std_ns, arm_facts = solve_arm(states, sweep.results[arm])
     records: list[FrameRecord] = []

@@ -10,7 +10,7 @@ from typing import Any
 from tvbrdf_messages.bag import LAUNCH, BagError, BagReader
 from tvbrdf_messages.run_directory import GRAPH_FILE
 
-from .selection import COMMAND, cameras_of
+from .selection import cameras_of, command_topic
 
 _MERGER, _WRITER = "HdrMergerNode", "DatabaseWriterNode"
 
@@ -73,7 +73,7 @@ def _given(bag: BagReader, node: str) -> dict[str, Any]:
 
 def _sample(bag: BagReader) -> str:
     """Return the sample that the first message names which is about one."""
-    topics = (COMMAND, "/scan/radiance", "/scan/parameters", "/scan/missing")
+    topics = (command_topic(bag.topics()), "/scan/radiance", "/scan/parameters", "/scan/missing")
     for _, envelope in bag.messages(topics):
         sample = str(getattr(envelope.message, "sample", ""))
         if sample:

@@ -21,6 +21,12 @@ class SelectionError(ValueError):
     """Topics were asked for that are not played; the text says which are."""
 
 
+def command_topic(recorded: Iterable[str]) -> str:
+    """Return under which name a bag has what the rig was told: the second if it is of a replay."""
+    has = set(recorded)
+    return TOLD_COMMAND if TOLD_COMMAND in has and COMMAND not in has else COMMAND
+
+
 def moves_hardware(topic: str) -> bool:
     """Return whether a device may act on what is said there."""
     return find_topic(topic).type is ScanCommand and topic != TOLD_COMMAND
@@ -47,15 +53,17 @@ def select(
         If a topic is unknown, may not be played, or is remapped to one of another type.
     """
     remap = dict(remap or {})
+    recorded = tuple(recorded)
+    command = command_topic(recorded)
     asked = tuple(topics)
     names = asked or tuple(sorted(filter(_by_default, map(_told, recorded))))
     chosen: dict[str, str] = {}
     for name in names:
         _check(name)
-        chosen[_recorded_as(name)] = remap.get(name, name)
+        chosen[command if name == TOLD_COMMAND else name] = remap.get(name, name)
     for old, new in remap.items():
         _check(new)
-        if _row_type(_recorded_as(old)) is not _row_type(new):
+        if _row_type(old) is not _row_type(new):
             raise SelectionError(
                 f"remap {old}:={new}: {old} carries {_row_type(old).__name__}, {new} carries "
                 f"{_row_type(new).__name__}; both must carry the same"
@@ -73,11 +81,11 @@ def preset(what: str, cameras: Iterable[str]) -> tuple[str, ...]:
     return (*of_cameras, "/arm/state", TOLD_COMMAND, "/scan/sweep_result", *_STORED_BESIDES)
 
 
-def needed(what: str) -> tuple[str, ...]:
+def needed(what: str, recorded: Iterable[str]) -> tuple[str, ...]:
     """Return the recorded topics without which a preset gives nothing, besides frames."""
     if what == RADIANCE:
         return ("/scan/radiance",)
-    return ("/arm/state", COMMAND, "/scan/sweep_result")
+    return ("/arm/state", command_topic(recorded), "/scan/sweep_result")
 
 
 def cameras_of(recorded: Iterable[str]) -> tuple[str, ...]:
@@ -88,10 +96,6 @@ def cameras_of(recorded: Iterable[str]) -> tuple[str, ...]:
 
 def _told(recorded: str) -> str:
     return TOLD_COMMAND if recorded == COMMAND else recorded
-
-
-def _recorded_as(name: str) -> str:
-    return COMMAND if name == TOLD_COMMAND else name
 
 
 def _by_default(name: str) -> bool:

@@ -17,10 +17,17 @@ from tvbrdf_messages.messages import Radiance
 from tvbrdf_messages.topics import find_topic
 
 from .read_ahead import Item, ReadAhead
-from .selection import COMMAND, RADIANCE, cameras_of, needed, preset, select
+from .selection import COMMAND, RADIANCE, TOLD_COMMAND, cameras_of, needed, preset, select
 
 NOTED = frozenset(
-    {COMMAND, "/scan/sweep_result", "/scan/radiance", "/scan/missing", "/operator/mark"}
+    {
+        COMMAND,
+        TOLD_COMMAND,
+        "/scan/sweep_result",
+        "/scan/radiance",
+        "/scan/missing",
+        "/operator/mark",
+    }
 )
 """Recorded topics that are decoded here: by them the player knows what is to be stored."""
 
@@ -130,7 +137,7 @@ def _in_epoch(body: bytes, epoch: int) -> bytes:
 def _require(reader: BagReader, what: str) -> None:
     """Refuse a bag without what the pipeline needs."""
     recorded = reader.topics()
-    missing = [topic for topic in needed(what) if topic not in recorded]
+    missing = [topic for topic in needed(what, recorded) if topic not in recorded]
     if what != RADIANCE and not cameras_of(recorded):
         missing.append("/CAMERA/frame")
     if not missing:

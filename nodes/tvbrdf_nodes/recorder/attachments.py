@@ -2,22 +2,58 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
-from tvbrdf_messages.bag import CALIBRATION, LAUNCH, NOTES, SCENE, About
+from tvbrdf_messages.bag import CALIBRATION, LAUNCH, NOTES, SCENE, SOURCE, About, BagReader
 from tvbrdf_messages.run_directory import GRAPH_FILE, Graph
+
+from ..core.loading import NODES
+from ..hdr_merger.calibration_source import inside, is_bag
 
 ARGUMENTS_FILE = "launch.json"
 SCENE_FILE = "scene.json"
 NOTES_NAME = f"{NOTES}.txt"
 SCENE_NAME = f"{SCENE}/{SCENE_FILE}"
+SOURCE_NAME = f"{SOURCE}/bag.json"
 
 
 def about_run(graph: Graph, extra: Mapping[str, str]) -> About:
     """Return where a bag of this run comes from; a directory may see several runs."""
+    source = source_of_run(graph)
+    if source is not None:
+        replayed = f"{source['name']}, recording {source['recording']} of run {source['run']}"
+        extra = {**extra, "replayed": replayed}
     return About(run=f"{Path(graph.directory).name}-{graph.utc_ns}", extra=extra)
+
+
+def source_of_run(graph: Graph) -> dict[str, Any] | None:
+    """Return which bag a run replays: name, path, and what it says of itself; None if it doesn't.
+
+    Raises
+    ------
+    BagError
+        If the bag can't be read.
+    """
+    players = [p for p in graph.participants if p.node == NODES["player"]]
+    if not players:
+        return None
+    with BagReader(players[0].parameters["bag"]) as bag:
+        about = bag.about
+        return {
+            "name": bag.path.resolve().name,
+            "path": str(bag.path.resolve()),
+            "files": {file.path.name: file.size_bytes for file in bag.files},
+            "run": about.run,
+            "recording": about.recording,
+            "recorded_with": about.version,
+            "created_ns": about.created_ns,
+            "start_ns": bag.start_ns,
+            "end_ns": bag.end_ns,
+        }
 
 
 def attachments_of_run(graph: Graph) -> dict[str, bytes]:
@@ -25,11 +61,13 @@ def attachments_of_run(graph: Graph) -> dict[str, bytes]:
 
     ``launch/*.yaml`` are the launch files as they were, ``launch/launch.json`` their arguments,
     ``launch/graph.json`` the nodes that came of them with all parameters; ``calibration/NAME`` the
-    calibration that nodes were given; ``scene/scene.json`` the simulated scene, once it is there.
+    calibration that nodes were given, or that is inside the bag that they were given; and
+    ``scene/scene.json`` the simulated scene, once it is there. Of a replay ``source/bag.json``
+    says which bag is played.
 
     Raises
     ------
-    OSError
+    OSError, BagError
         If one that is named can't be read.
     """
     run = Path(graph.directory)
@@ -40,13 +78,24 @@ def attachments_of_run(graph: Graph) -> dict[str, bytes]:
     for participant in graph.participants:
         given = participant.parameters.get("calibration")
         if isinstance(given, str) and given and Path(given).resolve() not in paths:
-            name = f"{CALIBRATION}/{Path(given).name}"
+            own_name, content = _calibration(given)
+            name = f"{CALIBRATION}/{own_name}"
             if name in found:  # another file of that name
-                name = f"{CALIBRATION}/{participant.name}_{Path(given).name}"
+                name = f"{CALIBRATION}/{participant.name}_{own_name}"
             paths[Path(given).resolve()] = name
-            found[name] = Path(given).read_bytes()
-    scene = scene_of_run(graph)
+            found[name] = content
+    source, scene = source_of_run(graph), scene_of_run(graph)
+    if source is not None:
+        found[SOURCE_NAME] = json.dumps(source, ensure_ascii=False, indent=1).encode()
     return found if scene is None else {**found, SCENE_NAME: scene}
+
+
+def _calibration(given: str) -> tuple[str, bytes]:
+    """Return name and content of a calibration: a file, or what is inside a bag."""
+    if not is_bag(given):
+        return Path(given).name, Path(given).read_bytes()
+    name, content = inside(given)
+    return Path(name).name, content
 
 
 def scene_of_run(graph: Graph) -> bytes | None:

@@ -18,12 +18,13 @@ from tvbrdf_messages.topics import find_topic
 
 from ..core.device import DeviceError
 from ..core.node import GIVE_UP, Exit, Node, NodeContext, Outputs, TopicUse
+from .log_times import LogTimes, Timed
 from .parameters import RecorderParameters
 from .record_book import COMPLETE, ENDED, BagEntry, RecordBook, describe_bag, topic_rows
-from .until_told import UntilTold
 
 if TYPE_CHECKING:
     from tvbrdf_messages.bag import BagError, BagWriter
+    from tvbrdf_messages.bag.streams import StreamCounts
 
     from .regions import UsedRegions
 
@@ -37,6 +38,7 @@ class RecorderNode(Node[RecorderParameters]):
 
     parameters_type = RecorderParameters
     drains = True
+    hears_itself = True
 
     def __init__(self, context: NodeContext, parameters: RecorderParameters) -> None:
         super().__init__(context, parameters)
@@ -44,9 +46,10 @@ class RecorderNode(Node[RecorderParameters]):
         self._entry: BagEntry | None = None
         self._writer: BagWriter | None = None
         self._regions: UsedRegions | None = None
+        self._came: StreamCounts | None = None
         self._marks: list[tuple[int, str, bool]] = []
         self._lacks_scene = False
-        self._until_told = UntilTold(context.graph, context.clock)
+        self._times = LogTimes(context.graph, context.clock)
         self._ended = ""
         """Why nothing more is recorded."""
         self._told = False
@@ -86,23 +89,25 @@ class RecorderNode(Node[RecorderParameters]):
 
     def prepare(self) -> None:
         """Begin the bag: the first life's as it was named, later ones' beside it."""
+        from tvbrdf_messages.bag import BagError
+
         from .attachments import SCENE_NAME, about_run, attachments_of_run, scene_of_run
         from .regions import UsedRegions
 
         own, graph = self.parameters, self.context.graph
-        try:
-            self._book = RecordBook(graph, self.context.name)
-            attachments = attachments_of_run(graph)
-        except (ValueError, OSError) as error:
-            raise DeviceError(f"can't record: {error}") from error
         if not own.full_frames and own.calibration:
             self._regions = UsedRegions(own.calibration, own.cameras, own.margin)
-        self._lacks_scene = bool(graph.publishers("/sim/scene")) and SCENE_NAME not in attachments
         frames = "all pixels" if self._regions is None else "what the calibration uses of each"
         extra = {"recorder": f"{self.context.name} {self.context.incarnation}", "frames": frames}
+        try:
+            self._book = RecordBook(graph, self.context.name)
+            about, attachments = about_run(graph, extra), attachments_of_run(graph)
+        except (ValueError, OSError, BagError) as error:
+            raise DeviceError(f"can't record: {error}") from error
+        self._lacks_scene = bool(graph.publishers("/sim/scene")) and SCENE_NAME not in attachments
         again = bool(self._book.entries)
         path = self._book.next_path(Path(own.path))
-        self._open(path, about_run(graph, extra), attachments, again)
+        self._open(path, about, attachments, again)
         if self._lacks_scene and scene_of_run(graph) is not None:
             self._attach_scene()
 
@@ -140,7 +145,7 @@ class RecorderNode(Node[RecorderParameters]):
 
     def stop(self) -> Outputs:
         """Finish the bag and say what is in it."""
-        for each in self._until_told.release():
+        for each in self._times.release():
             yield from self._record(each)
         writer = self._writer
         if writer is None:
@@ -164,22 +169,25 @@ class RecorderNode(Node[RecorderParameters]):
 
     def handle(self, envelope: Envelope) -> Outputs:
         """Record a message, or hold it until the run's clock is known."""
-        for each in self._until_told.take(envelope):
+        for each in self._times.take(envelope):
             yield from self._record(each)
 
-    def _record(self, envelope: Envelope) -> Outputs:
+    def _record(self, timed: Timed) -> Outputs:
         if self._writer is None:
             self._counters["not_recorded"] += 1
             return
         from tvbrdf_messages.bag import BagError
 
+        log_time_ns, envelope = timed
+        if self._is_again(envelope):
+            return
         message = envelope.message
         if isinstance(message, Frame) and self._regions is not None:
             envelope = envelope._replace(message=self._regions.blanked(message))
         elif isinstance(message, Mark):
             self._marks.append((envelope.header.stamp_ns, message.text, message.zero))
         try:
-            self._writer.write_envelope(envelope, self._until_told.log_time_ns(envelope))
+            self._writer.write_envelope(envelope, log_time_ns)
             self._counters["recorded"] += 1
         except MessageError as error:
             if not self._counters["unfit"]:
@@ -188,10 +196,20 @@ class RecorderNode(Node[RecorderParameters]):
         except BagError as error:
             yield from self._end(error)
 
+    def _is_again(self, envelope: Envelope) -> bool:
+        """Whether it is a kept message that came again because somebody else began to look on."""
+        from tvbrdf_messages.bag.streams import StreamCounts, StreamKey
+
+        if self._came is None:
+            self._came = StreamCounts()
+        header = envelope.header
+        stream = StreamKey(envelope.topic, header.publisher, header.incarnation)
+        return not self._came.add_new(stream, header.sequence)
+
     def on_timer(self, name: str) -> Outputs:
         """Give what was recorded to the system."""
         self.context.set_watchdog(_FLUSH, FLUSH_S)
-        for each in self._until_told.release():
+        for each in self._times.release():
             yield from self._record(each)
         if self._writer is None:
             return

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from tvbrdf_messages.messages import Frame
 
 from ..core.device import DeviceError
+from ..hdr_merger.calibration_source import read_calibration
 
 if TYPE_CHECKING:
     from tvbrdf_fitting.measurement.calibration import CameraCalibration, Rectangle
@@ -27,7 +28,7 @@ class UsedRegions:
     Parameters
     ----------
     calibration
-        Path of the calibration file; empty: everything is kept.
+        Path of the calibration file, or of a bag that has one inside; empty: everything is kept.
     cameras
         Names in the calibration's order.
     margin
@@ -45,12 +46,13 @@ class UsedRegions:
         self._slices: dict[tuple[str, int, int], tuple[Slices, ...]] = {}
         if not calibration:
             return
-        from tvbrdf_fitting.measurement.calibration import CalibrationError, load_calibration
+        from tvbrdf_fitting.measurement.calibration import CalibrationError
+        from tvbrdf_messages.bag import BagError
 
         try:
-            found = load_calibration(calibration)
+            found = read_calibration(calibration)
             self._cameras = {name: found.camera(i) for i, name in enumerate(cameras, start=1)}
-        except CalibrationError as error:
+        except (CalibrationError, BagError) as error:
             raise DeviceError(str(error)) from error
 
     def blanked(self, frame: Frame) -> Frame:

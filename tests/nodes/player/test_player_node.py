@@ -12,9 +12,10 @@ import pytest
 from benchmarks import playback
 from tests.nodes.stage import MakeStage, Stage
 from tests.replay_bags import write_bag
+from tests.sample_messages import camera_info
 from tvbrdf_messages.bag import BagWriter
 from tvbrdf_messages.envelope import Envelope, Header, in_epoch
-from tvbrdf_messages.messages import ArmState, CameraInfo, Clock, Diagnostics, Mark, ScanCommand
+from tvbrdf_messages.messages import ArmState, Clock, Diagnostics, Mark, ScanCommand
 from tvbrdf_messages.run_directory import Graph, Participant
 from tvbrdf_nodes.core.device import DeviceError
 from tvbrdf_nodes.core.parameters import ParameterError, build
@@ -37,10 +38,7 @@ def state(sequence: int, log_ns: int, incarnation: str = "one") -> Envelope:
 
 
 def info(sequence: int, log_ns: int) -> Envelope:
-    message = CameraInfo(
-        camera="camera_1", model="m", serial=str(sequence), width=8, height=8, bit_depth=12,
-        region_x=0, region_y=0, hardware_stamps=True, exact_exposure=True, frame_rate_hz=30.0,
-    )  # fmt: skip
+    message = camera_info(serial=str(sequence))
     return Envelope("/camera_1/info", header("camera_1", sequence, log_ns), message)
 
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from tvbrdf_messages.bag import BagReader
-from tvbrdf_messages.envelope import Envelope
-from tvbrdf_messages.messages import ArmState, CameraInfo, Diagnostics, Frame, Log
+from tests import sample_messages
+from tests.messages.bag_samples import read
+from tests.sample_messages import START_NS, noise
+from tvbrdf_messages.messages import Diagnostics, Frame, Log
 from tvbrdf_messages.run_directory import Graph, Participant
 from tvbrdf_messages.schema import Message
 from tvbrdf_nodes.core.inprocess import InProcessGraph
@@ -17,27 +18,21 @@ from tvbrdf_nodes.core.parameters import build
 from tvbrdf_nodes.recorder.node import RecorderNode
 from tvbrdf_nodes.recorder.parameters import RecorderParameters
 
-START_NS = 1_800_000_000_000_000_000
-STATE = ArmState(angle_deg=1.0, speed_deg_s=15.0, lamp=True, moving=True, homed=True)
-GIVES = ("/camera_1/frame", "/camera_1/info", "/arm/state", "/operator/mark", "/diagnostics")
-INFO = CameraInfo(
-    camera="camera_1",
-    model="m",
-    serial="1",
-    width=64,
-    height=48,
-    bit_depth=12,
-    region_x=0,
-    region_y=0,
-    hardware_stamps=True,
-    exact_exposure=True,
-    frame_rate_hz=30.0,
-)
+GIVES = ("/camera_1/frame", "/camera_1/info", "/arm/state", "/operator/mark")
+REPORTS = ("/diagnostics", "/log")
+MOST_STEPS = 100
+INFO = sample_messages.camera_info()
 
 
 def recorder_graph(
-    folder: Path, utc_ns: int = START_NS, *, simulated: bool = False, **parameters: Any
+    folder: Path,
+    utc_ns: int = START_NS,
+    *,
+    simulated: bool = False,
+    gives: tuple[str, ...] = GIVES,
+    **parameters: Any,
 ) -> Graph:
+    """Return a graph of a recorder and of who gives it something; only that is recorded."""
     parameters = {"path": str(folder / "bag"), "floor_free_mb": 0, **parameters}
     use = RecorderNode.topics("recorder", build(RecorderParameters, parameters))
     assert use.selects is not None
@@ -47,10 +42,10 @@ def recorder_graph(
         monotonic_ns=0,
         simulated=simulated,
         participants=(
-            Participant(name="source", gives=GIVES),
+            Participant(name="source", gives=gives),
             Participant(
                 name="recorder",
-                takes=(*use.takes, *filter(use.selects, GIVES)),
+                takes=(*use.takes, *filter(use.selects, gives)),
                 gives=use.gives,
                 node="tvbrdf_nodes.recorder.node:RecorderNode",
                 parameters=parameters,
@@ -81,8 +76,14 @@ class Recording:
         at_ns = START_NS + round(1e9 * seconds)
         self.graph.clock.tell(at_ns)
         self.source.publish(topic, message, stamp_ns=at_ns)
-        while self.graph.step():
-            pass
+        self.settle()
+
+    def settle(self) -> None:
+        """Let the recorder do all it can; it comes to an end."""
+        for _ in range(MOST_STEPS):
+            if not self.graph.step():
+                return
+        raise AssertionError(f"it is still busy after {MOST_STEPS} steps")
 
     def errors(self) -> list[str]:
         said = [envelope.message for envelope in self.graph.published("/log")]
@@ -96,28 +97,11 @@ class Recording:
 
 
 def frame(index: int = 0, kind: str = "light", height: int = 48, width: int = 64) -> Frame:
-    rng = np.random.default_rng([7, index])
-    return Frame(
-        camera="camera_1",
-        kind=kind,
-        sample="paint",
-        scan=1,
-        sweep=0,
-        attempt=1,
-        index=index,
-        exposure_ms=4.0,
-        bit_depth=12,
-        region_x=0,
-        region_y=0,
-        image=rng.integers(0, 4096, (height, width, 3), dtype=np.uint16),
+    return sample_messages.frame(
+        noise(7, index, height=height, width=width), index=index, kind=kind
     )
 
 
-def messages(bag: Path) -> list[tuple[int, Envelope]]:
-    with BagReader(bag) as reader:
-        return [(each.log_time_ns, each.envelope) for each in reader.messages()]
-
-
 def images(bag: Path) -> list[np.ndarray[Any, Any]]:
-    found = [envelope.message for _, envelope in messages(bag)]
+    found = [envelope.message for _, envelope in read(bag)]
     return [message.image for message in found if isinstance(message, Frame)]

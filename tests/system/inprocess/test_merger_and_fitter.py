@@ -206,6 +206,33 @@ def test_frames_that_are_not_the_calibrations_are_told_once(record: Run) -> None
     assert told[0].startswith("camera 4: frame is uint8 of shape (16, 16, 3)")
 
 
+@pytest.mark.parametrize("kept", [0, 5])
+def test_dark_frames_that_are_lost_break_the_first_sweep(record: Run, kept: int) -> None:
+    """It is taken again with them; the sweeps after it are not broken by what it lacked."""
+
+    def lose(envelope: Envelope, message: Any) -> Envelope | None:
+        dark = isinstance(message, Frame) and (message.camera, message.kind) == ("camera_2", "dark")
+        return None if dark and message.index >= kept else envelope
+
+    results = [r for r in record.on("/scan/sweep_result") if r.source == "camera_2"]
+    (sent,) = (r.frames for r in results if r.action == "dark")
+    frames = [e.message for e in record.messages if isinstance(e.message, Frame)]
+    got = len([f for f in frames if (f.camera, f.kind) == ("camera_2", "dark") and f.index < kept])
+    assert got < sent
+    with Bench(record.graph, "hdr_merger") as bench:
+        bench.feed(record, lose)
+        reason = f"camera_2 sent {sent} dark frames, {got} arrived"
+        assert bench.results()[0] == (0, "broken", reason)
+        assert bench.counters["frames_lost"] == sent - got
+        assert not bench.published(Radiance)
+        bench.graph.bus.taps.clear()
+        bench.feed(record, lambda e, m: new(e, attempt=2) if hasattr(m, "attempt") else e)
+        assert bench.results() == [(0, "done", ""), (1, "done", "")]
+        (radiance,) = bench.published(Radiance)
+        assert radiance.radiance.tobytes() == record.radiance[0].radiance.tobytes()
+        assert bench.counters["frames_lost"] == sent - got
+
+
 def test_dark_frames_with_light_in_them_break_the_sweep(record: Run) -> None:
     def leak(envelope: Envelope, message: Any) -> Envelope:
         if isinstance(message, Frame) and (message.camera, message.kind) == ("camera_1", "dark"):
@@ -218,10 +245,10 @@ def test_dark_frames_with_light_in_them_break_the_sweep(record: Run) -> None:
 
 
 def test_stills_and_broken_parts_are_passed_over(record: Run) -> None:
-    def add(envelope: Envelope, message: Any) -> Envelope:
+    def add(envelope: Envelope, message: Any) -> Envelope | None:
         if isinstance(message, Frame) and message.kind == "dark":
             return new(envelope, kind="still")
-        return envelope
+        return None if getattr(message, "action", "") == "dark" else envelope
 
     # without dark frames the calibration's nominal black level is used
     assert [state for _, state, _ in merge(record, add)] == ["done", "done"]

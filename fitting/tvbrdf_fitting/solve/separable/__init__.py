@@ -166,10 +166,11 @@ def compile_all() -> float:
 
 @cache
 def forget_stale_code() -> None:
-    """Give all sources of this folder the time of the newest one.
+    """Give all sources of this folder the time of the newest one; remove what is older.
 
     numba recompiles a function when the file that it stands in has another time than before; it
-    does not look at the files of what the function calls.
+    does not look at the files of what the function calls. And it reads what an index names before
+    it looks at the time, which fails where a class of ours has moved.
     """
     sources = {path: path.stat().st_mtime_ns for path in Path(__file__).parent.glob("*.py")}
     newest = max(sources.values())
@@ -177,3 +178,11 @@ def forget_stale_code() -> None:
         if changed_ns != newest:
             with suppress(OSError):  # an installation that can't be written is of one piece
                 os.utime(path, ns=(newest, newest))
+    from .search import solve as compiled
+
+    if newest > time.time_ns():  # by a clock that was wrong: nothing is newer
+        return
+    for index in Path(compiled.stats.cache_path).glob("*.nbi"):
+        with suppress(OSError):
+            if index.stat().st_mtime_ns < newest:
+                index.unlink()

@@ -1,4 +1,4 @@
-"""``python -m tvbrdf_fitting.solve.separable``: compile it, so that no later fit waits.
+"""``python -m tvbrdf_fitting.solve.separable``: compile all there is, so that nothing later waits.
 
 The compiled code is kept beside the sources, or where NUMBA_CACHE_DIR says.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 
+from ...published import compiled as _reader  # noqa: F401 # compiles when it is imported
 from . import compile_all
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,8 +43,15 @@ def utc(time_ns: int) -> str:
     return f"{moment:%Y-%m-%d %H:%M:%S}.{time_ns // 10**6 % 1000:03} UTC"
 
 
+def print_removed(removed: Iterable[Path]) -> None:
+    """Print what was cleared away before the work began."""
+    for folder in removed:
+        print(f"removed {folder}: what a run that was killed had left of the same output")
+
+
 def print_edit(report: EditReport, why_left_out: str) -> None:
     """Print what came of making a bag."""
+    print_removed(report.removed)
     print(f"{report.out}: {report.messages} messages")
     for topic, count in sorted(report.topics.items()):
         print(f"  {topic}: {count}")

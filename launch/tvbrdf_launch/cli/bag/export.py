@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .._common import Subparsers, add_json_option, add_verb, print_json
-from ._options import add_bag
+from ._options import add_bag, print_removed
 
 if TYPE_CHECKING:
     from ...export import Report
@@ -62,10 +62,10 @@ def run(arguments: argparse.Namespace) -> int:
     from ...export import export_bag
     from ...export.exr import ExrOptions
     from ...refit.settings import read_calibration_file
-    from ..refit import _progress
+    from ..refit import progress_bar
 
     given = arguments.calibration
-    with _progress() as tell:
+    with progress_bar() as tell:
         report = export_bag(
             arguments.bag,
             arguments.out,
@@ -82,6 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print(report: Report) -> None:
+    print_removed(report.removed)
     for written in report.written:
         counts = ", ".join(f"{name}: {count}" for name, count in sorted(written.counts.items()))
         print(f"{report.out / written.path}: {counts}")

@@ -11,7 +11,7 @@ from ._options import add_bag, utc
 if TYPE_CHECKING:
     from tvbrdf_messages.bag import BagSummary
 
-SHOWN_GAPS = 10
+SHOWN_GAPS = SHOWN_JUMPS = 10
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -36,6 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     _print_whole(summary)
     _print_topics(summary)
     _print_gaps(summary)
+    _print_clock_jumps(summary)
     return 0
 
 
@@ -99,3 +100,14 @@ def _print_gaps(summary: BagSummary) -> None:
         print(f"  {stream.topic} of {stream.publisher} ({stream.incarnation}): {numbers}")
     if len(gaps) > SHOWN_GAPS:
         print(f"  and {len(gaps) - SHOWN_GAPS} more (all with --json)")
+
+
+def _print_clock_jumps(summary: BagSummary) -> None:
+    if not summary.clock_jumps:
+        return
+    print("Jumps of clocks:")
+    for jump in summary.clock_jumps[:SHOWN_JUMPS]:
+        after_s = (jump.log_time_ns - summary.start_ns) / 1e9
+        print(f"  {jump.topic}, {after_s:.3f} s after the start: {jump.text}")
+    if len(summary.clock_jumps) > SHOWN_JUMPS:
+        print(f"  and {len(summary.clock_jumps) - SHOWN_JUMPS} more (all with --json)")

@@ -130,11 +130,11 @@ def _record(
     from tvbrdf_messages.bus.watcher import Watcher
     from tvbrdf_messages.clock import RunClock, SystemClock, ToldClock
     from tvbrdf_messages.messages import Clock
-    from tvbrdf_nodes.recorder.until_told import UntilTold
+    from tvbrdf_nodes.recorder.log_times import LogTimes
 
     told = ToldClock(graph.utc_ns)
     clock: RunClock = told if graph.simulated else SystemClock(graph.utc_ns, graph.monotonic_ns)
-    until_told = UntilTold(graph, clock)
+    times = LogTimes(graph, clock)
     # frames have a short queue, which must not be that of the rest
     frames = [topic for topic in topics if topic.endswith("/frame")]
     rest = [topic for topic in topics if topic not in frames]
@@ -154,18 +154,18 @@ def _record(
                     if isinstance(envelope.message, Clock):
                         told.tell(envelope.message.now_ns, envelope.message.epoch)
                     continue
-                for each in until_told.take(envelope):
-                    writer.write_envelope(each, until_told.log_time_ns(each))
+                for each in times.take(envelope):
+                    writer.write_envelope(each.envelope, each.log_time_ns)
             now_s = time.monotonic()
             if now_s >= flush_s:
                 flush_s = now_s + 1.0
-                for each in until_told.release():
-                    writer.write_envelope(each, until_told.log_time_ns(each))
+                for each in times.release():
+                    writer.write_envelope(each.envelope, each.log_time_ns)
                 writer.flush()
             if now_s - quiet_s > REST_S and not is_going_on(run):
                 break
-        for each in until_told.release():
-            writer.write_envelope(each, until_told.log_time_ns(each))
+        for each in times.release():
+            writer.write_envelope(each.envelope, each.log_time_ns)
 
 
 def _arrived(watchers: list[Watcher]) -> Iterator[Any]:

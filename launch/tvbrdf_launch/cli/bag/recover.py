@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .._common import Subparsers, add_json_option, add_verb, print_json
-from ._options import add_bag, utc
+from ._options import add_bag, print_removed, utc
 
 if TYPE_CHECKING:
     from tvbrdf_messages.bag import Lost, RecoverReport
@@ -46,6 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _print(report: RecoverReport) -> None:
     from ...text import size
 
+    print_removed(report.removed)
     print(f"{report.out}: {report.messages} messages saved and read back")
     if report.messages:
         print(f"  from {utc(report.start_ns)} to {utc(report.end_ns)}")

@@ -65,13 +65,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     plan: Plan = grid.QUICK if arguments.quick else grid.Plan()
     out: Path = arguments.out
-    out.mkdir(parents=True, exist_ok=True)  # before the minutes of work, if it can't be made
+    measured = None if arguments.path is None else read(arguments.path, arguments.scan)
+    # before the minutes of work, if it can't be made; after what else can be wrong
+    out.mkdir(parents=True, exist_ok=True)
     cells: list[Cell]
-    if arguments.path is None:
+    if measured is None:
         title = f"Oren-Nayar + Torrance-Sparrow, {plan.scenes} simulated materials"
         cells = grid.simulate(plan, _progress())
     else:
-        observations, number = read(arguments.path, arguments.scan)
+        observations, number = measured
         title = f"{arguments.path.resolve().name}, scan {number}, against the fit of all of it"
         cells = grid.on_scan(observations, plan, _progress())
     rows = [cell.as_dict() for cell in cells]

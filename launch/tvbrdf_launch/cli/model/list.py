@@ -22,13 +22,21 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(rows)
         return 0
-    shown = [{**row, "options": ", ".join(row["options"])} for row in rows]
+    shown = [
+        {**row, "options": ", ".join(row["options"]), "summary": row["summary"] + _aliases(row)}
+        for row in rows
+    ]
     print_table(shown, ("name", "options", "symbols", "summary"))
     print(
         "\nA name is one model, with options in brackets, or a sum, as in "
-        "'oren_nayar+torrance_sparrow(coloured)';\na layer comes first. [bgr]: one a channel."
+        "'oren_nayar+torrance_sparrow(coloured)'\nor by aliases 'ON+TS(coloured)'; a layer comes "
+        "first. [bgr]: one a channel."
     )
     return 0
+
+
+def _aliases(row: dict[str, Any]) -> str:
+    return "".join(f", alias {alias!r}" for alias in row["aliases"])
 
 
 def _models() -> Iterator[dict[str, Any]]:
@@ -42,6 +50,7 @@ def _models() -> Iterator[dict[str, Any]]:
         own = [p for p in model.parameters if p.name not in surface]
         yield {
             "name": entry.name,
+            "aliases": [entry.alias] if entry.alias else [],
             "options": [*entry.options],
             "exclusive": [[*group] for group in entry.exclusive],
             "layer": entry.over,
@@ -60,9 +69,9 @@ def _sums() -> Iterator[dict[str, Any]]:
     names = [n for n in catalogue() if "+" in n and not any(part.over for part, _ in split(n))]
     for name in dict.fromkeys([*names, *ALIASES.values()]):
         model = get_model(name)
-        aliases = [alias for alias, full in ALIASES.items() if full == name]
         yield {
             "name": name,
+            "aliases": [alias for alias, full in ALIASES.items() if full == name],
             "options": [],
             "exclusive": [],
             "layer": False,
@@ -70,5 +79,5 @@ def _sums() -> Iterator[dict[str, Any]]:
             "reciprocal": model.reciprocal,
             "parameters": [*model.parameter_names],
             "symbols": short_names(model.parameters),
-            "summary": "sum in common use" + "".join(f", alias {alias!r}" for alias in aliases),
+            "summary": "sum in common use",
         }
