@@ -106,11 +106,14 @@ def fit_parameters(
             return separable.solve_many(problem, measured[chunk], own, rows)
         return _solve_each(problem, measured[chunk], own, rows, method)
 
-    with ThreadPoolExecutor(count) as pool:
-        try:
-            parts = list(pool.map(work, chunks))
-        except ValueError as error:
-            raise _unusable(measured, spread) or error from error
+    try:
+        if count == 1:
+            parts = [work(chunks[0])]
+        else:
+            with ThreadPoolExecutor(count) as pool:
+                parts = list(pool.map(work, chunks))
+    except ValueError as error:
+        raise _unusable(measured, spread) or error from error
     internal, costs, evaluations, converged = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )

@@ -91,9 +91,7 @@ def solve_many(
     from .search import EXHAUSTED
 
     lower, upper = limits(problem, layout)
-    geometry = geometry_of(
-        problem.model, layout, problem.prepared, problem.to_radiance * (1 / np.pi)
-    )
+    geometry = geometry_of(problem, layout)
     xs = np.zeros((len(radiances), len(lower)))
     costs, counts = np.zeros(len(radiances)), np.zeros((len(radiances), 3), dtype=np.int64)
     run = solve_alike if variances.ndim == 2 else solve_each

@@ -13,8 +13,10 @@ from ...models import Lambert, OrenNayar, ReflectanceModel, SumModel, TorranceSp
 from ...models.oren_nayar_short import OrenNayarShort
 from ...problem import Problem
 
+Geometry = tuple[FloatArray, FloatArray, FloatArray]
+"""What belongs to the directions alone: vectors, f, q."""
 Data = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
-"""What the compiled functions take: vectors, f, q, radiance, weight."""
+"""What the compiled functions take: the same, radiance, weight."""
 _FULL, _SHORT_E = (0.33, 0.17), 0.0
 
 
@@ -69,16 +71,30 @@ def layout_of(model: ReflectanceModel) -> Layout | None:
 
 def data_of(problem: Problem, layout: Layout) -> Data:
     """Return the vectors of a problem that the compiled functions take."""
-    vectors, f, q = geometry_of(
-        problem.model, layout, problem.prepared, problem.to_radiance * (1 / np.pi)
-    )
-    return vectors, f, q, problem.radiance, problem.weight
+    return *geometry_of(problem, layout), problem.radiance, problem.weight
 
 
-def geometry_of(
+def geometry_of(problem: Problem, layout: Layout) -> Geometry:
+    """Return vectors (3, n), f (n,) and q (n,) of a problem's directions.
+
+    Those of the last directions are kept, for fits that are repeated with other weights.
+    """
+    prepared, to_radiance = problem.prepared, problem.to_radiance
+    key = id(layout), id(prepared), id(to_radiance)
+    if (kept := _LAST.get(key)) is not None:
+        return kept[0]
+    geometry = _geometry(problem.model, layout, prepared, to_radiance * (1 / np.pi))
+    _LAST.clear()
+    _LAST[key] = geometry, prepared, to_radiance  # alive, so that the ids stay theirs
+    return geometry
+
+
+_LAST: dict[tuple[int, int, int], tuple[Geometry, Any, FloatArray]] = {}
+
+
+def _geometry(
     model: ReflectanceModel, layout: Layout, prepared: Any, cosine: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return vectors (3, n), f (n,) and q (n,) for prepared directions and the lights' cosines."""
+) -> Geometry:
     parts = model.parts if isinstance(model, SumModel) else (model,)
     prepared = prepared if isinstance(model, SumModel) else (prepared,)
     vectors = np.zeros((3, len(cosine)))

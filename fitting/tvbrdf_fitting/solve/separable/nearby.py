@@ -34,8 +34,9 @@ _TS = -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
 _POWERS = np.linalg.inv(np.vander(_TS, increasing=True))
 """Chebyshev's nodes, and what turns values there into coefficients, of the lowest power first."""
 _STEPS = 12
-_THERE = 1e-7
-"""Relative step at which the next one would be below the polynomials' own error."""
+_NEAR, _THERE = 1e-4, 1e-6
+"""Relative steps after which the last one is taken, and up to which it is the last: what an
+undamped Newton step leaves is some square of it."""
 
 
 class Nearby(NamedTuple):
@@ -191,8 +192,7 @@ def approach(x, scan, us, near, lower, upper, columns, room):
             length += (step[i] * scale[i]) ** 2
             extent += (x[i] * scale[i]) ** 2
             downhill -= 0.5 * gradient[i] * step[i]
-        near_enough = length <= (_THERE * _THERE) * extent
-        if not length < np.inf or (there and not near_enough):
+        if not length < np.inf or (there and length > (_THERE * _THERE) * extent):
             break
         # within reach the whole step, else so much of it
         t = (x[last] + step[last] - us[chosen]) / _REACH
@@ -201,7 +201,7 @@ def approach(x, scan, us, near, lower, upper, columns, room):
             x[i] = clip(x[i] + part * step[i], lower[i], upper[i])
         if there:
             return cost - downhill, elsewhere
-        there = near_enough
+        there = length <= (_NEAR * _NEAR) * extent
         if abs(t) > 1:
             chosen = int(np.argmin(np.abs(us - x[last])))
             _write_data(near, chosen, us[chosen], scan, data)

@@ -144,41 +144,54 @@ def write_exponentials(q, scale, out):
 
 
 @njit(fastmath=SUMS, **JIT)
-def _square(values):
-    for i in range(values.shape[0]):
-        # no denormals, which are slow
-        values[i] = values[i] * values[i] if values[i] > 1e-140 else 0.0
-
-
-@njit(fastmath=SUMS, **JIT)
-def _add_lobe_products(f, falloff, x0, x1, x2, s0, s1, s2, y0, y1, y2, products):
-    a0 = a1 = a2 = a3 = a4 = 0.0
-    b0 = b1 = b2 = b3 = b4 = 0.0
-    c0 = c1 = c2 = c3 = c4 = 0.0
-    for i in range(f.shape[0]):
-        lobe = f[i] * falloff[i]
-        u, v, w, square = lobe * x0[i], lobe * x1[i], lobe * x2[i], lobe * lobe
-        a0 += s0[i] * u
-        a1 += s0[i] * v
-        a2 += s0[i] * w
-        a3 += s0[i] * square
-        a4 += y0[i] * lobe
-        b0 += s1[i] * u
-        b1 += s1[i] * v
-        b2 += s1[i] * w
-        b3 += s1[i] * square
-        b4 += y1[i] * lobe
-        c0 += s2[i] * u
-        c1 += s2[i] * v
-        c2 += s2[i] * w
-        c3 += s2[i] * square
-        c4 += y2[i] * lobe
-    for k, (a, b, c) in enumerate(
-        ((a0, b0, c0), (a1, b1, c1), (a2, b2, c2), (a3, b3, c3), (a4, b4, c4))
-    ):
-        products[0, k] += a
-        products[1, k] += b
-        products[2, k] += c
+def _add_lobe_products(
+    scale, power, nearest, f, q, falloff, x0, x1, x2, s0, s1, s2, y0, y1, y2, products
+):
+    k = 0
+    while k < nearest.shape[0]:
+        first = k
+        while k < nearest.shape[0] and nearest[k] * scale < _OUT:
+            k += 1
+        # unsigned, so that no index can mean one from the end, and the loops vectorise
+        begin, end = np.uint64(first * BLOCK), np.uint64(min(k * BLOCK, f.shape[0]))
+        if power == 2:
+            for i in range(begin, end):
+                # no denormals, which are slow
+                falloff[i] = falloff[i] * falloff[i] if falloff[i] > 1e-140 else 0.0
+        else:
+            for i in range(begin, end):
+                falloff[i] = exp_negative(q[i] * scale)
+        a0 = a1 = a2 = a3 = a4 = 0.0
+        b0 = b1 = b2 = b3 = b4 = 0.0
+        c0 = c1 = c2 = c3 = c4 = 0.0
+        for i in range(begin, end):
+            lobe = f[i] * falloff[i]
+            u, v, w, square = lobe * x0[i], lobe * x1[i], lobe * x2[i], lobe * lobe
+            a0 += s0[i] * u
+            a1 += s0[i] * v
+            a2 += s0[i] * w
+            a3 += s0[i] * square
+            a4 += y0[i] * lobe
+            b0 += s1[i] * u
+            b1 += s1[i] * v
+            b2 += s1[i] * w
+            b3 += s1[i] * square
+            b4 += y1[i] * lobe
+            c0 += s2[i] * u
+            c1 += s2[i] * v
+            c2 += s2[i] * w
+            c3 += s2[i] * square
+            c4 += y2[i] * lobe
+        for m, (a, b, c) in enumerate(
+            ((a0, b0, c0), (a1, b1, c1), (a2, b2, c2), (a3, b3, c3), (a4, b4, c4))
+        ):
+            products[0, m] += a
+            products[1, m] += b
+            products[2, m] += c
+        if k < nearest.shape[0]:
+            for i in range(np.uint64(k * BLOCK), np.uint64(min((k + 1) * BLOCK, f.shape[0]))):
+                falloff[i] = 0.0
+        k += 1
 
 
 @njit(**JIT)
@@ -189,71 +202,67 @@ def write_lobe_products(scale, power, scan, falloff, products):
     square of what `falloff` (n,) holds, that of half the scale. Blocks of rows in which a narrow
     lobe is 0 to all digits are left out; there the falloff gets 0.
     """
-    vectors, f, q, blocks = scan.vectors, scan.f, scan.q, scan.nearest
-    squares, weighted = scan.squares, scan.weighted
+    x, squares, weighted = scan.vectors, scan.squares, scan.weighted
     products[:, :] = 0.0
-    k = 0
-    while k < blocks.shape[0]:
-        first = k
-        while k < blocks.shape[0] and blocks[k] * scale < _OUT:
-            k += 1
-        if k > first:
-            a, z = first * BLOCK, min(k * BLOCK, f.shape[0])
-            part = falloff[a:z]
-            if power == 2:
-                _square(part)
-            else:
-                write_exponentials(q[a:z], scale, part)
-            # one-dimensional slices are known to be contiguous, so the sums vectorise
-            _add_lobe_products(
-                f[a:z],
-                part,
-                vectors[0, a:z],
-                vectors[1, a:z],
-                vectors[2, a:z],
-                squares[0, a:z],
-                squares[1, a:z],
-                squares[2, a:z],
-                weighted[0, a:z],
-                weighted[1, a:z],
-                weighted[2, a:z],
-                products,
-            )
-        if k < blocks.shape[0]:
-            falloff[k * BLOCK : min((k + 1) * BLOCK, f.shape[0])] = 0.0
-        k += 1
+    _add_lobe_products(
+        scale,
+        power,
+        scan.nearest,
+        scan.f,
+        scan.q,
+        falloff,
+        x[0],
+        x[1],
+        x[2],
+        squares[0],
+        squares[1],
+        squares[2],
+        weighted[0],
+        weighted[1],
+        weighted[2],
+        products,
+    )
 
 
 @njit(fastmath=SUMS, **JIT)
-def _add_data_products(lobe0, lobe1, lobe2, lobe3, lobe4, y0, y1, y2, lobes):
-    a0 = a1 = a2 = a3 = a4 = 0.0
-    b0 = b1 = b2 = b3 = b4 = 0.0
-    c0 = c1 = c2 = c3 = c4 = 0.0
-    for i in range(y0.shape[0]):
-        one, two, three = y0[i], y1[i], y2[i]
-        v = lobe0[i]
-        a0 += one * v
-        b0 += two * v
-        c0 += three * v
-        v = lobe1[i]
-        a1 += one * v
-        b1 += two * v
-        c1 += three * v
-        v = lobe2[i]
-        a2 += one * v
-        b2 += two * v
-        c2 += three * v
-        v = lobe3[i]
-        a3 += one * v
-        b3 += two * v
-        c3 += three * v
-        v = lobe4[i]
-        a4 += one * v
-        b4 += two * v
-        c4 += three * v
-    for c, channel in enumerate(((a0, a1, a2, a3, a4), (b0, b1, b2, b3, b4), (c0, c1, c2, c3, c4))):
-        for m in range(lobes.shape[0]):
-            lobes[m, c, 4] += channel[m]
+def _add_data_products(scale, nearest, lobe0, lobe1, lobe2, lobe3, lobe4, y0, y1, y2, lobes):
+    k = 0
+    while k < nearest.shape[0]:
+        first = k
+        while k < nearest.shape[0] and nearest[k] * scale < _OUT:
+            k += 1
+        a0 = a1 = a2 = a3 = a4 = 0.0
+        b0 = b1 = b2 = b3 = b4 = 0.0
+        c0 = c1 = c2 = c3 = c4 = 0.0
+        for i in range(np.uint64(first * BLOCK), np.uint64(min(k * BLOCK, y0.shape[0]))):
+            one, two, three = y0[i], y1[i], y2[i]
+            v = lobe0[i]
+            a0 += one * v
+            b0 += two * v
+            c0 += three * v
+            v = lobe1[i]
+            a1 += one * v
+            b1 += two * v
+            c1 += three * v
+            v = lobe2[i]
+            a2 += one * v
+            b2 += two * v
+            c2 += three * v
+            v = lobe3[i]
+            a3 += one * v
+            b3 += two * v
+            c3 += three * v
+            v = lobe4[i]
+            a4 += one * v
+            b4 += two * v
+            c4 += three * v
+        for c, channel in enumerate(
+            ((a0, a1, a2, a3, a4), (b0, b1, b2, b3, b4), (c0, c1, c2, c3, c4))
+        ):
+            # where the last group repeats the last lobe, what comes of that is not added
+            for m in range(lobes.shape[0]):
+                lobes[m, c, 4] += channel[m]
+        k += 1
 
 
 @njit(**JIT)
@@ -263,25 +272,18 @@ def write_data_products(scales, table, nearest, weighted, lobes):
     Five at a time: reading the data takes longer than multiplying them.
     """
     lobes[:, :, 4] = 0.0
-    end = scales.shape[0]
-    for m in range(0, end, _TOGETHER):
-        last, k = end - 1, 0
-        while k < nearest.shape[0]:
-            first = k
-            while k < nearest.shape[0] and nearest[k] * scales[m] < _OUT:
-                k += 1
-            if k > first:
-                a, z = first * BLOCK, min(k * BLOCK, table.shape[1])
-                # the last group repeats the last lobe, and what comes of that is not added
-                _add_data_products(
-                    table[m, a:z],
-                    table[min(m + 1, last), a:z],
-                    table[min(m + 2, last), a:z],
-                    table[min(m + 3, last), a:z],
-                    table[min(m + 4, last), a:z],
-                    weighted[0, a:z],
-                    weighted[1, a:z],
-                    weighted[2, a:z],
-                    lobes[m : min(m + _TOGETHER, end)],
-                )
-            k += 1
+    last = scales.shape[0] - 1
+    for m in range(0, last + 1, _TOGETHER):
+        _add_data_products(
+            scales[m],
+            nearest,
+            table[m],
+            table[min(m + 1, last)],
+            table[min(m + 2, last)],
+            table[min(m + 3, last)],
+            table[min(m + 4, last)],
+            weighted[0],
+            weighted[1],
+            weighted[2],
+            lobes[m : m + _TOGETHER],
+        )
