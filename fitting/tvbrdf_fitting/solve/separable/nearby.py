@@ -34,7 +34,7 @@ _TS = -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
 _POWERS = np.linalg.inv(np.vander(_TS, increasing=True))
 """Chebyshev's nodes, and what turns values there into coefficients, of the lowest power first."""
 _STEPS = 12
-_NEAR, _THERE = 1e-4, 1e-6
+_NEAR, _THERE = 1e-5, 1e-7
 """Relative steps after which the last one is taken, and up to which it is the last: what an
 undamped Newton step leaves is some square of it."""
 
