@@ -27,14 +27,6 @@ LIMIT_S = 60.0
 DAY_NS = 86_400_000_000_000
 AHEAD_NS = 250_000_000
 """Of its clock, how far a simulated camera may stamp frames."""
-LAUNCH_FILE = """
-arguments: {bag: {}, database: {}, record: {}}
-include: [{file: REPLAY, arguments: {bag: $(var bag), database: $(var database)}}]
-nodes:
-  - name: recorder
-    node: recorder
-    parameters: {path: $(var record), calibration: $(var bag), floor_free_mb: 0}
-"""
 
 
 def run(graph: Graph) -> list[Radiance]:
@@ -70,10 +62,8 @@ def replay(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         shutil.copy(BAG, source / "monday_0.mcap")
     else:
         shutil.copy(BAG, source)
-    path = folder / "recorded_replay.yaml"
-    path.write_text(LAUNCH_FILE.replace("REPLAY", str(find_launch_file("replay"))))
     words = {"bag": str(source), "database": str(folder / "db"), "record": str(folder / "again")}
-    graph = make_plan(load_launch_file(path, words, folder), folder).graph
+    graph = make_plan(load_launch_file(find_launch_file("replay"), words, folder), folder).graph
     # launched before or after the times in the bag
     utc_ns = START_NS + DAY_NS * (1 if request.param == "file" else -1)
     radiance = run(replace(graph, utc_ns=utc_ns))
