@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tvbrdf_messages.run_directory import Graph
 
 CONNECT_S = 5.0
-LATE_S = 3.0
+LATE_S = 10.0
 """What a still may need to get here after the cameras have said that all are taken."""
 
 Stills = dict[str, list["Frame"]]
