@@ -48,10 +48,10 @@ def graph(directory: str) -> Graph:
     )
 
 
-def frame(index: int, image: Any) -> Frame:
+def frame(index: int, image: Any, camera: str = "camera_1") -> Frame:
     """Return a frame message."""
     return Frame(
-        camera="camera_1",
+        camera=camera,
         kind="light",
         sample="bench",
         scan=1,

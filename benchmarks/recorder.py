@@ -22,9 +22,9 @@ import numpy as np
 import zmq
 from mcap.writer import CompressionType, Writer
 
+from benchmarks.bus import frame
 from tvbrdf_messages.bag import BagReader
 from tvbrdf_messages.bus import ZmqPort
-from tvbrdf_messages.messages import Frame
 from tvbrdf_messages.run_directory import Graph, Participant
 from tvbrdf_nodes.core.loading import NODES
 
@@ -61,24 +61,6 @@ def graph(directory: str, *, required: bool) -> Graph:
     )
 
 
-def frame(camera: str, index: int) -> Frame:
-    """Return a frame message."""
-    return Frame(
-        camera=camera,
-        kind="light",
-        sample="bench",
-        scan=1,
-        sweep=0,
-        attempt=1,
-        index=index,
-        exposure_ms=4.0,
-        bit_depth=12,
-        region_x=0,
-        region_y=0,
-        image=IMAGES[index % len(IMAGES)],
-    )
-
-
 class Cameras:
     """Four publishers in this process, and the recorder in its own."""
 
@@ -99,7 +81,8 @@ class Cameras:
     def send(self) -> None:
         """Publish a frame of the camera whose turn it is."""
         port = self._ports[self._sent % len(self._ports)]
-        message = frame(port.name, self._sent // len(self._ports))
+        index = self._sent // len(self._ports)
+        message = frame(index, IMAGES[index % len(IMAGES)], port.name)
         port.publish(f"/{port.name}/frame", message, stamp_ns=time.time_ns())
         self._sent += 1
 

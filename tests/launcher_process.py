@@ -27,6 +27,8 @@ class LauncherProcess:
 
     limit_s = 30.0
     """Anything that takes longer hangs."""
+    mark = "XDG_RUNTIME_DIR"
+    """Variable that tells the run's processes, grandchildren too."""
 
     def __init__(self, runtime: Path, folder: Path) -> None:
         self.runtime, self.folder = runtime, folder
@@ -98,7 +100,7 @@ class LauncherProcess:
 
     def processes(self) -> list[int]:
         """Return every process that has this run's environment, grandchildren too."""
-        mark = f"XDG_RUNTIME_DIR={self.runtime}".encode()
+        mark = f"{self.mark}={self.runtime}".encode()
         found = []
         for path in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):

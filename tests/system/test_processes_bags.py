@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import shutil
 import signal
@@ -66,6 +65,7 @@ class Example(LauncherProcess):
     """The script in a process of its own; everything that it starts has its ``TMPDIR``."""
 
     limit_s = 500.0
+    mark = "TMPDIR"
 
     def __init__(self, folder: Path) -> None:
         # the path of a Unix socket has at most 107 characters
@@ -84,17 +84,6 @@ class Example(LauncherProcess):
                 stdout=output,
                 stderr=subprocess.STDOUT,
             )
-
-    def processes(self) -> list[int]:
-        mark = f"TMPDIR={self.runtime}".encode()
-        found = []
-        for path in Path("/proc").glob("[0-9]*"):
-            with contextlib.suppress(OSError):
-                variables = (path / "environ").read_bytes().split(b"\0")
-                state = (path / "stat").read_text().rpartition(")")[2].split()[0]
-                if mark in variables and state not in "ZX":
-                    found.append(int(path.name))
-        return found
 
     def expect_nothing_left(self) -> None:
         self.expect_no_process(30.0)
