@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
+from ..core.awake_time import AwakeTime
 from ..core.device import DeviceError, DriverContext
 from .driver import (
     Acknowledged,
@@ -58,6 +59,7 @@ class SerialArm:
     def __init__(self, parameters: SerialArmParameters, context: DriverContext) -> None:
         self._parameters, self._context = parameters, context
         self._port: SerialLine | None = None
+        self._awake = AwakeTime()
         self._parser = WatchedParser()
         self._requests = PendingRequests(
             self._write, context.clock, parameters.answer_timeout_s, parameters.attempts
@@ -79,11 +81,11 @@ class SerialArm:
 
     def open(self) -> None:
         """Open the port; the controller is identified, stopped and made dark while reading."""
-        self._connect_limit_s = time.monotonic() + self._parameters.connect_timeout_s
+        self._connect_limit_s = self._awake.now_s() + self._parameters.connect_timeout_s
         self._try_open()
 
     def _try_open(self) -> None:
-        parameters, now_s = self._parameters, time.monotonic()
+        parameters, now_s = self._parameters, self._awake.now_s()
         if now_s < self._next_try_s:
             return
         self._next_try_s = now_s + RETRY_OPEN_S
@@ -170,7 +172,7 @@ class SerialArm:
 
     def keepalive(self) -> None:
         """See :class:`.driver.ArmDriver`."""
-        now_s = time.monotonic()
+        now_s = self._awake.now_s()
         known = self._port is not None and self._handshake.identity is not None
         if not known or now_s < self._next_alive_s:
             return
@@ -332,7 +334,7 @@ class SerialArm:
     # -- what goes wrong
 
     def _check_time(self) -> None:
-        now_s = time.monotonic()
+        now_s = self._awake.now_s()
         lost = [
             pending.request.verb
             for pending in self._requests.expire()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import select
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,7 +54,6 @@ class SerialLine:
                 url,
                 baudrate=baud_rate,
                 timeout=0,
-                write_timeout=None if url.startswith("rfc2217:") else WRITE_LIMIT_S,
                 exclusive=True if is_path(url) else None,
             )
         except (OSError, ValueError, NotImplementedError) as error:
@@ -62,6 +62,7 @@ class SerialLine:
             self._port.set_low_latency_mode(True)  # USB adapters hold bytes for 16 ms otherwise
         try:
             self._waitable: Any = self._port.fileno()
+            self._port.write_timeout = 0
         except (AttributeError, io.UnsupportedOperation):
             self._port.timeout = READ_WAIT_S
             self._thread = ReaderThread(self._grab, "serial")
@@ -102,16 +103,21 @@ class SerialLine:
             If the port is gone, or takes no bytes for half a second.
         """
         try:
-            self._port.write(data)
-        except serial.SerialTimeoutException as error:
-            raise DeviceError(
-                f"{self.url}: the arm's port takes no bytes for {WRITE_LIMIT_S} s; "
-                "check the cable and flow control"
-            ) from error
+            while data:
+                # pyserial's own limit strikes also where the machine stood still after the writing
+                if self._thread is None and not self._takes_bytes():
+                    raise DeviceError(
+                        f"{self.url}: the arm's port takes no bytes for {WRITE_LIMIT_S} s; "
+                        "check the cable and flow control"
+                    )
+                data = data[self._port.write(data) :]
         except (OSError, TypeError) as error:
             raise DeviceError(
                 f"{self.url}: the arm's port is gone (unplugged?): {_text(error)}"
             ) from error
+
+    def _takes_bytes(self) -> bool:
+        return bool(select.select([], [self._waitable], [], WRITE_LIMIT_S)[1])
 
     def close(self) -> None:
         """Release the port; may be called twice."""

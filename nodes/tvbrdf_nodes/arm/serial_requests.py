@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import random
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from tvbrdf_messages.clock import RunClock
 
+from ..core.awake_time import AwakeTime
 from .protocol import MAX_ID, Answer, Request, encode
 
 Handler = Callable[[Answer], None]
@@ -40,7 +40,7 @@ class PendingRequests:
     clock
         The run's clock, for the stamps of round trips.
     timeout_s
-        Real time that an answer may take.
+        Real time that an answer may take; a gap in which this process stood still is not counted.
     attempts
         How often a request is sent before it is given up.
     """
@@ -50,6 +50,7 @@ class PendingRequests:
     ) -> None:
         self._write, self._clock = write, clock
         self._timeout_s, self._attempts = timeout_s, attempts
+        self._awake = AwakeTime()
         self._pending: dict[int, Pending] = {}
         # answers to an earlier life of this process must not be taken for answers to this one
         self._ids = itertools.count(random.randrange(1, MAX_ID // 2))
@@ -79,7 +80,7 @@ class PendingRequests:
         pending.attempts -= 1
         pending.sent_ns = self._clock.now_ns()
         self._write(pending.line)
-        pending.deadline_s = time.monotonic() + self._timeout_s
+        pending.deadline_s = self._awake.now_s() + self._timeout_s
 
     def take(self, request_id: int) -> Pending | None:
         """Return and forget the request that an answer belongs to; None if there is none."""
@@ -98,7 +99,7 @@ class PendingRequests:
 
     def expire(self) -> list[Pending]:
         """Repeat what is late; return and forget what was sent often enough."""
-        now_s = time.monotonic()
+        now_s = self._awake.now_s()
         given_up = []
         for number, pending in list(self._pending.items()):
             if pending.deadline_s > now_s:

@@ -18,6 +18,7 @@ from typing import Any
 from tvbrdf_messages.envelope import Envelope
 from tvbrdf_messages.messages import SimGrant, SimHorizon, SimScene
 
+from ..core.awake_time import AwakeTime
 from ..core.device import DeviceError
 from ..core.node import Node, NodeContext, Outputs, Send, TopicUse
 from ..world.scene import scene_from_dict
@@ -58,6 +59,7 @@ class SimulatedController(Node[ControllerParameters]):
         self._progress = False
         self._saved: dict[str, Any] = {}
         self._save_after_s = 0.0
+        self._awake = AwakeTime()
 
     @classmethod
     def topics(cls, name: str, parameters: ControllerParameters) -> TopicUse:
@@ -127,12 +129,12 @@ class SimulatedController(Node[ControllerParameters]):
         """Whether a grant is unfinished and the reader keeps up."""
         return self._progress
 
-    def _read(self, firmware: Firmware) -> None:
+    def _read(self, firmware: Firmware, awake_s: float) -> None:
         with contextlib.suppress(BlockingIOError):
             while data := os.read(self._master, 4096):
                 for line in self._parser.feed(data):
                     if isinstance(line.message, Request):
-                        firmware.execute(line.message, time.monotonic())
+                        firmware.execute(line.message, awake_s)
 
     def _write(self, wire: Wire) -> None:
         if self._master < 0:
@@ -153,12 +155,12 @@ class SimulatedController(Node[ControllerParameters]):
         if firmware is None or wire is None:
             return
         self._progress = False
-        now_s = time.monotonic()  # before reading: a keepalive that waits here is in time
+        awake_s, now_s = self._awake.now_s(), time.monotonic()
         if self._master >= 0:
-            self._read(firmware)
+            self._read(firmware, awake_s)
         elif self._replug_s is not None and now_s >= self._replug_s:
             self._plug_in()
-        firmware.check_watchdog(now_s)
+        firmware.check_watchdog(awake_s)  # a keepalive that waited here is in time
         wire.release_late()
         self._write(wire)
         done = firmware.advance(self._granted_ns, lambda: len(wire.waiting) <= QUEUE_BYTES)

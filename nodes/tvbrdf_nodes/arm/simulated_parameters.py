@@ -27,7 +27,7 @@ class ControllerParameters:
     """Of the microsecond counter; 32 bits wrap around after 71.6 minutes."""
     keepalive_watchdog: bool = True
     watchdog_s: float = 0.5
-    """Real time after the last keepalive until it stops by itself."""
+    """Real time in which the twin ran, from the last keepalive until it stops by itself."""
 
     def __post_init__(self) -> None:
         """Refuse values that make no sense."""

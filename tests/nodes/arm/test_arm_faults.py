@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -112,6 +113,20 @@ def test_late_answers_are_waited_for_and_nothing_is_done_twice(make_arm_rig: Mak
         assert (result.state, result.reason) == ("done", "")
     rig.run(lambda: rig.runners["arm"].node.diagnostics()["answers_unasked"] >= 1, "a late answer")
     rig.run(lambda: rig.states()[-1][1].angle_deg == 30.0)
+
+
+def test_a_machine_that_stood_still_is_nobodys_fault(make_arm_rig: Make) -> None:
+    # nobody runs in that time: the node sends no keepalive, and its controller no answer
+    rig = make_arm_rig().start_all()
+    rig.run(lambda: rig.runners["arm_controller"].node.diagnostics()["requests"], "a request")
+    time.sleep(1.2)
+    rig.homed()
+    jog = rig.send("jog", to_deg=30.0)
+    rig.run(lambda: rig.states()[-1][1].moving, "the beginning")
+    time.sleep(1.2)
+    rig.run(lambda: rig.results(jog), "the end")
+    assert (rig.results(jog)[0].state, rig.results(jog)[0].reason) == ("done", "")
+    assert not rig.kept_state()["stopped_by_watchdog"]
 
 
 @pytest.mark.parametrize("repeated", [True, False])

@@ -21,7 +21,7 @@ import serial.rfc2217
 from tvbrdf_messages.clock import SystemClock
 from tvbrdf_nodes.arm.protocol import Answer, Event, Request, encode
 from tvbrdf_nodes.arm.serial_arm import SerialArm
-from tvbrdf_nodes.arm.serial_line import byte_time_ns
+from tvbrdf_nodes.arm.serial_line import SerialLine, byte_time_ns
 from tvbrdf_nodes.arm.serial_motions import Ended, MotionTable
 from tvbrdf_nodes.arm.serial_parameters import SerialArmParameters
 from tvbrdf_nodes.arm.serial_requests import PendingRequests
@@ -287,6 +287,21 @@ def test_network_connection_that_ends(make_arm: Callable[..., SerialArm]) -> Non
         arm.open()
         listener.accept()[0].close()
         assert "port is gone (unplugged?): " in read_until_error(arm)
+
+
+def test_port_that_takes_no_bytes() -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    line = SerialLine(os.ttyname(slave), 115200, SystemClock())
+    try:
+        line.write(bytes(1000))
+        assert os.read(master, 2000) == bytes(1000)
+        with pytest.raises(DeviceError, match=r"takes no bytes for 0\.5 s; check the cable"):
+            line.write(bytes(1_000_000))
+    finally:
+        line.close()
+        os.close(master)
+        os.close(slave)
 
 
 # -- its parts
