@@ -76,6 +76,7 @@ def make_plan(launch: LaunchFile, run: Path) -> Plan:
         monotonic_ns=time.monotonic_ns(),
         simulated="/clock" in topics,
         participants=participants,
+        working_directory=str(Path.cwd()),
     )
     _check_graph(graph, checked)
     nodes = tuple(PlannedNode(e.name, e.restart, e.ends_run) for e in launch.nodes)

@@ -46,6 +46,12 @@ class Graph:
     monotonic_ns: int
     simulated: bool
     participants: tuple[Participant, ...]
+    working_directory: str = ""
+    """Of the launcher and its nodes."""
+
+    def located(self, path: str) -> Path:
+        """Return where a path is that a node of this run was given."""
+        return Path(self.working_directory, path)
 
     def find(self, name: str) -> Participant:
         """Return the participant of that name."""

@@ -41,7 +41,7 @@ def source_of_run(graph: Graph) -> dict[str, Any] | None:
     players = [p for p in graph.participants if p.node == NODES["player"]]
     if not players:
         return None
-    with BagReader(players[0].parameters["bag"]) as bag:
+    with BagReader(graph.located(players[0].parameters["bag"])) as bag:
         about = bag.about
         return {
             "name": bag.path.resolve().name,
@@ -74,15 +74,18 @@ def attachments_of_run(graph: Graph) -> dict[str, bytes]:
     files = sorted((run / "launch").glob("*.y*ml"))
     files += [run / name for name in (ARGUMENTS_FILE, GRAPH_FILE) if (run / name).is_file()]
     found = {f"{LAUNCH}/{path.name}": path.read_bytes() for path in files}
-    paths: dict[Path, str] = {}
+    taken: set[Path] = set()
     for participant in graph.participants:
         given = participant.parameters.get("calibration")
-        if isinstance(given, str) and given and Path(given).resolve() not in paths:
-            own_name, content = _calibration(given)
+        if not isinstance(given, str) or not given:
+            continue
+        path = graph.located(given)
+        if path.resolve() not in taken:
+            own_name, content = _calibration(path)
             name = f"{CALIBRATION}/{own_name}"
             if name in found:  # another file of that name
                 name = f"{CALIBRATION}/{participant.name}_{own_name}"
-            paths[Path(given).resolve()] = name
+            taken.add(path.resolve())
             found[name] = content
     source, scene = source_of_run(graph), scene_of_run(graph)
     if source is not None:
@@ -90,11 +93,11 @@ def attachments_of_run(graph: Graph) -> dict[str, bytes]:
     return found if scene is None else {**found, SCENE_NAME: scene}
 
 
-def _calibration(given: str) -> tuple[str, bytes]:
+def _calibration(path: Path) -> tuple[str, bytes]:
     """Return name and content of a calibration: a file, or what is inside a bag."""
-    if not is_bag(given):
-        return Path(given).name, Path(given).read_bytes()
-    name, content = inside(given)
+    if not is_bag(str(path)):
+        return path.name, path.read_bytes()
+    name, content = inside(str(path))
     return Path(name).name, content
 
 

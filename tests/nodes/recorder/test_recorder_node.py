@@ -27,6 +27,7 @@ from tvbrdf_messages.messages import Diagnostics, Frame, Log, Mark
 from tvbrdf_nodes.core.device import DeviceError
 from tvbrdf_nodes.core.node import GIVE_UP
 from tvbrdf_nodes.core.parameters import ParameterError, build
+from tvbrdf_nodes.recorder.attachments import attachments_of_run
 from tvbrdf_nodes.recorder.node import selection
 from tvbrdf_nodes.recorder.parameters import RecorderParameters
 from tvbrdf_nodes.recorder.record_book import RecordBook
@@ -74,6 +75,14 @@ def test_what_is_said_is_in_the_bag(tmp_path: Path) -> None:
         assert attached["notes.txt"] == b"2027-01-15T08:00:03.000+00:00 [t = 0] paint applied\n"
         assert str(START_NS) in bag.about.run
         assert bag.about.version
+
+
+def test_a_calibration_is_found_from_another_folder(tmp_path: Path) -> None:
+    """Nodes take relative paths from the launcher's folder; who records later may be elsewhere."""
+    graph = recorder_graph(tmp_path, calibration=CALIBRATION_FILE.name)
+    there = replace(graph, working_directory=str(CALIBRATION_FILE.parent))
+    attached = attachments_of_run(there)
+    assert attached == {"calibration/calibration.yaml": CALIBRATION_FILE.read_bytes()}
 
 
 def test_counts_and_gaps_are_told(tmp_path: Path) -> None:
