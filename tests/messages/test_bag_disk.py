@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import errno
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -28,10 +27,12 @@ from tvbrdf_messages.bag import (
 
 LIMIT_BYTES = 300_000
 RECORDER = """
+import resource
 import sys
 from pathlib import Path
 from tests.messages.bag_samples import rig_messages
 from tvbrdf_messages.bag import BagError, BagWriter
+resource.setrlimit(resource.RLIMIT_FSIZE, 2 * (int(sys.argv[2]),))
 try:
     with BagWriter(Path(sys.argv[1]), compression="none") as writer:
         for log_time_ns, envelope in rig_messages(60):
@@ -46,12 +47,11 @@ def test_a_file_that_may_not_grow(tmp_path: Path) -> None:
     """The system's own limit (RLIMIT_FSIZE): a whole bag remains, a second is lost."""
     path = tmp_path / "a.mcap"
     done = subprocess.run(
-        [sys.executable, "-c", RECORDER, str(path)],
+        [sys.executable, "-c", RECORDER, str(path), str(LIMIT_BYTES)],
         capture_output=True,
         text=True,
         cwd=ROOT,
         check=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT_BYTES, LIMIT_BYTES)),
     )
     assert done.stdout.startswith(f"BagWriteError {path}: can't be written: File too large;")
     found = read(path)
