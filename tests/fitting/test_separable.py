@@ -109,7 +109,7 @@ def test_normal_equations_are_those_of_the_model(simulate: Simulate, name: str) 
     np.testing.assert_allclose(gradient, jacobian.T @ residual, rtol=1e-10)
     np.testing.assert_allclose(matrix, jacobian.T @ jacobian, rtol=1e-10, atol=1e-9)
     alone = np.empty(size)
-    assert equations.cost_and_gradient(x, scan, columns, alone) == pytest.approx(cost, rel=1e-14)
+    assert equations.cost_and_gradient(x, scan, columns[0], alone) == pytest.approx(cost, rel=1e-14)
     np.testing.assert_allclose(alone, gradient, rtol=1e-10)
     # the full second derivatives, by differences of the gradient
     second = hessian.copy()
@@ -136,10 +136,10 @@ def test_polynomials_give_the_normal_equations(simulate: Simulate, name: str, u:
     exact = np.empty(size), np.empty((size, size)), np.empty((size, size))
     equations.normal_equations(x, scan, False, np.empty((3, len(scan.f))), *exact)
     us = np.array([u - 0.17, u + 0.2])  # the nearest width is as far as it can be
-    near, data = nearby.new_nearby(len(us), len(scan.f)), np.empty((3, 10))
-    nearby._write_data(near, 0, us[0], scan, data)
+    near = nearby.new_nearby(len(us), len(scan.f))
+    nearby._write_polynomials(near, 0, us[0], scan)
     lobe, slope, bend = np.empty((3, 5)), np.empty((3, 5)), np.empty((3, 5))
-    nearby._write_products((u - us[0]) / nearby._REACH, near.own[0], data, lobe, slope, bend)
+    nearby._write_products((u - us[0]) / nearby._REACH, near.products[0], lobe, slope, bend)
     found = np.empty(size), np.empty((size, size)), np.empty((size, size))
     nearby._write_equations(x, scan, lobe, slope, bend, np.empty(16), *found)
     scale = np.sqrt(np.diag(exact[1]))
@@ -246,6 +246,18 @@ class TestBatch:
         found = SOLVERS["separable"](single).internal
         np.testing.assert_allclose(alike.values[7], model.to_published(found), rtol=1e-9)
         assert alike.chi_square[7] == pytest.approx(2 * single.cost(found), rel=1e-9)
+
+    def test_layout_and_unused_values_do_not_matter(self, simulate: Simulate) -> None:
+        observations, radiance = self.batch(simulate)
+        light, view = observations.light_direction, observations.view_direction
+        variance = np.where(observations.valid, observations.variance, np.inf)
+        variance[50, 1] = np.inf
+        whole = fit_parameters(light, view, radiance, variance)
+        other = np.asfortranarray(radiance)
+        other[:, 50, 1] = [np.nan, np.inf] * 10
+        for variances in (variance, np.asfortranarray(np.tile(variance, (20, 1, 1)))):
+            found = fit_parameters(light, view, other, variances)
+            np.testing.assert_allclose(found.values, whole.values, rtol=1e-9)
 
     @pytest.mark.parametrize("name", [SURFACE, COLOURED])
     def test_is_as_low_as_single_fits_everywhere(self, simulate: Simulate, name: str) -> None:

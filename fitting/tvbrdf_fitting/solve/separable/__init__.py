@@ -92,6 +92,7 @@ def solve_many(
 
     lower, upper = limits(problem, layout)
     geometry = geometry_of(problem, layout)
+    radiances, variances = np.ascontiguousarray(radiances), np.ascontiguousarray(variances)
     xs = np.zeros((len(radiances), len(lower)))
     costs, counts = np.zeros(len(radiances)), np.zeros((len(radiances), 3), dtype=np.int64)
     run = solve_alike if variances.ndim == 2 else solve_each

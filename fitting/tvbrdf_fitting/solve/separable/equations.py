@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from .elementary import JIT, SUMS
+from .elementary import JIT, SUMS, exp_negative
 from .products import write_exponentials
 
 
@@ -82,29 +82,60 @@ def _write_sums(a0, a1, a2, ks, radiance, squares, x0, x1, x2, lobe, slope, bend
 
 
 @njit(fastmath=SUMS, **JIT)
-def _write_slope(f, q, scale, lobe, slope):
-    """Turn the falloff into the lobe and write its slope by u."""
-    for i in range(q.shape[0]):
-        value = f[i] * lobe[i]
-        lobe[i] = value
-        slope[i] = -2.0 * min(q[i] * scale, 1e3) * value
+def _add_residual_sums(weights, f, q, scale, r0, r1, r2, s0, s1, s2, x0, x1, x2, lobe, sums):
+    """Add the sums of r with r, the vectors, the lobe and its slope: the first six of all, (3, 6).
 
-
-@njit(fastmath=SUMS, **JIT)
-def _write_residual_sums(a0, a1, a2, ks, radiance, squares, x0, x1, x2, lobe, slope, sums):
-    """Write the sums of r with r, the vectors, the lobe and its slope: the first six of all."""
+    `weights` (3, 4) are the factors of the vectors and of the lobe in each channel.
+    """
+    for i in range(f.shape[0]):
+        lobe[i] = f[i] * exp_negative(q[i] * scale)
+    a0, a1, a2, a3 = weights[0, 0], weights[0, 1], weights[0, 2], weights[0, 3]
+    b0, b1, b2, b3 = weights[1, 0], weights[1, 1], weights[1, 2], weights[1, 3]
+    c0, c1, c2, c3 = weights[2, 0], weights[2, 1], weights[2, 2], weights[2, 3]
     o0 = o1 = o2 = o3 = o4 = o5 = 0.0
-    for i in range(radiance.shape[0]):
+    p0 = p1 = p2 = p3 = p4 = p5 = 0.0
+    t0 = t1 = t2 = t3 = t4 = t5 = 0.0
+    for i in range(f.shape[0]):
         one, two, three, p = x0[i], x1[i], x2[i], lobe[i]
-        r = (a0 * one + a1 * two + a2 * three + ks * p) - radiance[i]
-        wr = squares[i] * r
-        o0 += wr * r
-        o1 += wr * one
-        o2 += wr * two
-        o3 += wr * three
-        o4 += wr * p
-        o5 += wr * slope[i]
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = o0, o1, o2, o3, o4, o5
+        # far out the lobe is 0 to all digits, and 0 x inf must not arise
+        d = -2.0 * min(q[i] * scale, 1e3) * p
+        r = (a0 * one + a1 * two + a2 * three + a3 * p) - r0[i]
+        w = s0[i] * r
+        o0 += w * r
+        o1 += w * one
+        o2 += w * two
+        o3 += w * three
+        o4 += w * p
+        o5 += w * d
+        r = (b0 * one + b1 * two + b2 * three + b3 * p) - r1[i]
+        w = s1[i] * r
+        p0 += w * r
+        p1 += w * one
+        p2 += w * two
+        p3 += w * three
+        p4 += w * p
+        p5 += w * d
+        r = (c0 * one + c1 * two + c2 * three + c3 * p) - r2[i]
+        w = s2[i] * r
+        t0 += w * r
+        t1 += w * one
+        t2 += w * two
+        t3 += w * three
+        t4 += w * p
+        t5 += w * d
+    for m, (o, p, t) in enumerate(
+        (
+            (o0, p0, t0),
+            (o1, p1, t1),
+            (o2, p2, t2),
+            (o3, p3, t3),
+            (o4, p4, t4),
+            (o5, p5, t5),
+        )
+    ):
+        sums[0, m] += o
+        sums[1, m] += p
+        sums[2, m] += t
 
 
 @njit(**JIT)
@@ -212,30 +243,38 @@ def normal_equations(x, scan, known, columns, gradient, matrix, hessian):
 
 
 @njit(**JIT)
-def cost_and_gradient(x, scan, columns, gradient):
-    """Return what `normal_equations` does, of true residuals; write only the gradient."""
+def cost_and_gradient(x, scan, falloff, gradient):
+    """Return what `normal_equations` does, of true residuals; write only the gradient.
+
+    `falloff` (n,) is overwritten.
+    """
     last = x.shape[0] - 1
     coefficients = diffuse_coefficients(x[3], scan.form)
-    scale = math.exp(2 * x[last])
-    write_exponentials(scan.q, scale, columns[0])
-    _write_slope(scan.f, scan.q, scale, columns[0], columns[1])
-    gradient[:] = 0.0
-    cost, sums = 0.0, np.empty(6)
+    weights, sums = np.empty((3, 4)), np.zeros((3, 6))
     for c in range(3):
         kd = x[c]
-        _write_residual_sums(
-            kd * coefficients[0],
-            kd * coefficients[1],
-            kd * kd * coefficients[2],
-            x[4 + c] if last == 7 else x[4],
-            scan.radiance[c],
-            scan.squares[c],
-            scan.vectors[0],
-            scan.vectors[1],
-            scan.vectors[2],
-            columns[0],
-            columns[1],
-            sums,
-        )
-        cost += add_gradient(x, c, coefficients, sums, gradient)
+        weights[c, 0], weights[c, 1] = kd * coefficients[0], kd * coefficients[1]
+        weights[c, 2], weights[c, 3] = kd * kd * coefficients[2], x[4 + c] if last == 7 else x[4]
+    r, s, v = scan.radiance, scan.squares, scan.vectors
+    _add_residual_sums(
+        weights,
+        scan.f,
+        scan.q,
+        math.exp(2 * x[last]),
+        r[0],
+        r[1],
+        r[2],
+        s[0],
+        s[1],
+        s[2],
+        v[0],
+        v[1],
+        v[2],
+        falloff,
+        sums,
+    )
+    gradient[:] = 0.0
+    cost = 0.0
+    for c in range(3):
+        cost += add_gradient(x, c, coefficients, sums[c], gradient)
     return cost

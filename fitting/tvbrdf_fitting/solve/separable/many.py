@@ -19,22 +19,46 @@ from .search import search, solve_weighted
 from .widths import Sweep, nearest_seen, seen_amplitudes, shifted, widths_between
 
 
-@njit(**JIT)
-def _take_squares(variance, rows, squares):
-    """Write 1 / variance (n, 3) of some rows as (3, n); return whether all can be used."""
+@njit(fastmath=SUMS, **JIT)
+def _all_positive(values):
     good = True
-    for i in range(rows.shape[0]):
-        for c in range(3):
-            spread = variance[rows[i], c]
-            good &= spread > 0  # False for NaN
-            squares[c, i] = 1 / spread
+    for i in range(values.shape[0]):
+        good &= values[i] > 0  # False for NaN
     return good
+
+
+@njit(fastmath=SUMS, **JIT)
+def _all_finite(values):
+    total = 0.0
+    for i in range(values.shape[0]):
+        total += 0.0 * values[i]
+    return total == 0
 
 
 @njit(**JIT)
 def _transpose(values, one, two, three):
     for i in range(one.shape[0]):
         one[i], two[i], three[i] = values[i, 0], values[i, 1], values[i, 2]
+
+
+@njit(**JIT)
+def _take_squares(variance, rows, squares):
+    """Write 1 / variance (n, 3) of some rows as (3, n); return whether all can be used."""
+    n = rows.shape[0]
+    if rows[n - 1] - rows[0] == n - 1:
+        some = variance[rows[0] : rows[0] + n]
+        good = _all_positive(some.reshape(3 * n))  # see `_take_radiance`
+        _transpose(some, squares[0], squares[1], squares[2])
+    else:
+        good = True
+        for i in range(n):
+            for c in range(3):
+                squares[c, i] = variance[rows[i], c]
+                good &= squares[c, i] > 0
+    for c in range(3):
+        for i in range(n):
+            squares[c, i] = 1 / squares[c, i]
+    return good
 
 
 @njit(fastmath=SUMS, **JIT)
@@ -53,7 +77,12 @@ def _take_radiance(values, rows, squares, radiance):
     """Write values (n, 3) of some rows as (3, n), 0 without weight; say whether all are finite."""
     n = rows.shape[0]
     if rows[n - 1] - rows[0] == n - 1:
-        _transpose(values[rows[0] : rows[0] + n], radiance[0], radiance[1], radiance[2])
+        some = values[rows[0] : rows[0] + n]
+        # reading it straight on first also brings it near: transposing takes long from afar
+        finite = _all_finite(some.reshape(3 * n))
+        _transpose(some, radiance[0], radiance[1], radiance[2])
+        if finite:
+            return True
     else:
         for i in range(n):
             for c in range(3):

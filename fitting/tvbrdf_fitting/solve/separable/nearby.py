@@ -15,7 +15,7 @@ from numba import njit
 
 from ...geometry import BoolArray, FloatArray
 from .amplitudes import ROUGH, best_at_width
-from .elementary import JIT, bounded_step, clip, write_scale
+from .elementary import JIT, SUMS, bounded_step, clip, write_scale
 from .equations import (
     add_curvature,
     add_gradient,
@@ -48,66 +48,36 @@ class Nearby(NamedTuple):
         (w,) whether a width's are written.
     lobes
         (w, k, n) lobes at the k nodes.
-    own
-        (w, 3, 4, k) coefficients of their products with the vectors and with themselves.
+    products
+        (w, 3, 5, k) coefficients of their products with the vectors, with themselves, and with the
+        data of the scan that was last there.
     """
 
     ready: BoolArray
     lobes: FloatArray
-    own: FloatArray
+    products: FloatArray
 
 
 @njit(**JIT)
 def new_nearby(widths, n):
     """Return polynomials for a number of widths and n observations, none of them written."""
     return Nearby(
-        np.zeros(widths, np.bool_), np.empty((widths, _NODES, n)), np.empty((widths, 3, 4, _NODES))
+        np.zeros(widths, np.bool_), np.empty((widths, _NODES, n)), np.empty((widths, 3, 5, _NODES))
     )
 
 
-@njit(**JIT)
-def _write_coefficients(values, channel, kind, coefficients):
-    """Write the polynomial through values (k, 3, 5) of a channel and kind at the nodes."""
-    for k in range(_NODES):
-        total = 0.0
-        for j in range(_NODES):
-            total += _POWERS[k, j] * values[j, channel, kind]
-        coefficients[k] = total
-
-
-@njit(**JIT)
-def _prepare(near, chosen, scales, scan, products):
-    """Write the lobes of a width's nodes and the polynomials of what belongs to them alone."""
-    for j in range(_NODES):
-        lobe = near.lobes[chosen, j]
-        write_lobe_products(scales[j], 1, scan, lobe, products[j])
-        for i in range(lobe.shape[0]):
-            lobe[i] *= scan.f[i]
-    for c in range(3):
-        for kind in range(4):
-            _write_coefficients(products, c, kind, near.own[chosen, c, kind])
-    near.ready[chosen] = True
-
-
-@njit(**JIT)
-def _write_derivatives(t, coefficients, out):
-    """Write a polynomial's value and its first two derivatives by u."""
-    value = slope = bend = 0.0
-    for k in range(_NODES - 1, -1, -1):
-        bend = bend * t + slope
-        slope = slope * t + value
-        value = value * t + coefficients[k]
-    out[0], out[1], out[2] = value, slope / _REACH, 2 * bend / _REACH**2
-
-
-@njit(**JIT)
-def _write_products(t, own, data, products, slopes, bends):
+@njit(fastmath=SUMS, **JIT)
+def _write_products(t, coefficients, products, slopes, bends):
     """Write a lobe's products (3, 5), and their derivatives by u."""
-    three = np.empty(3)
     for c in range(3):
-        for k in range(5):
-            _write_derivatives(t, data[c] if k == 4 else own[c, k], three)
-            products[c, k], slopes[c, k], bends[c, k] = three[0], three[1], three[2]
+        for kind in range(5):
+            value = slope = bend = 0.0
+            for k in range(_NODES - 1, -1, -1):
+                bend = bend * t + slope
+                slope = slope * t + value
+                value = value * t + coefficients[c, kind, k]
+            products[c, kind] = value
+            slopes[c, kind], bends[c, kind] = slope / _REACH, 2 * bend / _REACH**2
 
 
 @njit(**JIT)
@@ -149,14 +119,25 @@ def _write_equations(x, scan, products, slopes, bends, sums, gradient, matrix, h
 
 
 @njit(**JIT)
-def _write_data(near, chosen, centre, scan, data):
+def _write_polynomials(near, chosen, centre, scan):
     """Write the polynomials of a width's lobes with the data; those of lobes alone if need be."""
-    scales, products = np.exp(2 * (centre + _REACH * _TS)), np.empty((_NODES, 3, 5))
+    scales, values = np.exp(2 * (centre + _REACH * _TS)), np.empty((_NODES, 3, 5))
+    lobes, first = near.lobes[chosen], 4
     if not near.ready[chosen]:
-        _prepare(near, chosen, scales, scan, products)
-    write_data_products(scales, near.lobes[chosen], scan.nearest, scan.weighted, products)
+        first = 0
+        for j in range(_NODES):
+            write_lobe_products(scales[j], 1, scan, lobes[j], values[j])
+            for i in range(scan.f.shape[0]):
+                lobes[j, i] *= scan.f[i]
+        near.ready[chosen] = True
+    write_data_products(scales, lobes, scan.nearest, scan.weighted, values)
     for c in range(3):
-        _write_coefficients(products, c, 4, data[c])
+        for kind in range(first, 5):
+            for k in range(_NODES):
+                total = 0.0
+                for j in range(_NODES):
+                    total += _POWERS[k, j] * values[j, c, kind]
+                near.products[chosen, c, kind, k] = total
 
 
 @njit(**JIT)
@@ -167,11 +148,11 @@ def approach(x, scan, us, near, lower, upper, columns, room):
     """
     size, last = x.shape[0], x.shape[0] - 1
     chosen = int(np.argmin(np.abs(us - x[last])))
-    data, sums = np.empty((3, _NODES)), np.empty(16)
-    _write_data(near, chosen, us[chosen], scan, data)
+    _write_polynomials(near, chosen, us[chosen], scan)
     products, slopes, bends = np.empty((3, 5)), np.empty((3, 5)), np.empty((3, 5))
+    sums = np.empty(16)
     t = (x[last] - us[chosen]) / _REACH
-    _write_products(t, near.own[chosen], data, products, slopes, bends)
+    _write_products(t, near.products[chosen], products, slopes, bends)
     _, elsewhere = best_at_width(x, scan.form, scan.diffuse, products, lower, upper, ROUGH, room)
     step, scale, free = np.empty(size), np.empty(size), np.ones(size, np.bool_)
     gradient, work, factor = np.empty(size), np.empty((2, size)), np.empty((size, size))
@@ -179,7 +160,7 @@ def approach(x, scan, us, near, lower, upper, columns, room):
     cost, there = 0.0, False
     for _ in range(_STEPS):
         if there:
-            cost = cost_and_gradient(x, scan, columns, gradient)
+            cost = cost_and_gradient(x, scan, columns[0], gradient)
         else:
             _write_equations(x, scan, products, slopes, bends, sums, gradient, matrix, hessian)
         write_scale(x, matrix, gradient, lower, upper, scale, free)
@@ -204,9 +185,9 @@ def approach(x, scan, us, near, lower, upper, columns, room):
         there = length <= (_NEAR * _NEAR) * extent
         if abs(t) > 1:
             chosen = int(np.argmin(np.abs(us - x[last])))
-            _write_data(near, chosen, us[chosen], scan, data)
+            _write_polynomials(near, chosen, us[chosen], scan)
             t = (x[last] - us[chosen]) / _REACH
             if abs(t) > 1:
                 break
-        _write_products(t, near.own[chosen], data, products, slopes, bends)
+        _write_products(t, near.products[chosen], products, slopes, bends)
     return np.inf, elsewhere
