@@ -305,6 +305,16 @@ class TestBatch:
             fit_parameters(light, view, radiance[:1], np.full_like(variance, np.inf))
 
 
+def test_loading_the_solver_loads_no_general_optimiser() -> None:
+    """A fitter's start is a part of a run's."""
+    code = (
+        "import sys, tvbrdf_fitting.fit; from tvbrdf_fitting.solve import separable;"
+        "separable.compile_all(); print('scipy.optimize' in sys.modules)"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout == "False\n"
+
+
 def test_a_given_start_leads_into_its_own_valley(simulate: Simulate) -> None:
     model = get_model(SURFACE)
     observations = simulate([0.3, 0.5, 0.7, 0.3, 0.05, 40.0], noise=0.002, step=3)

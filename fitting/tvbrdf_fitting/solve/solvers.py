@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from ..geometry import FloatArray
 from ..problem import Problem, Solution, Solver
@@ -67,6 +66,8 @@ class _Run:
     def _minimise(
         self, full: FloatArray, moving: tuple[int, ...], tolerance: float, steps: int
     ) -> FloatArray:
+        from scipy.optimize import least_squares  # takes long, and the compiled search needs none
+
         chosen = list(moving)
 
         def whole(x: FloatArray) -> FloatArray:
@@ -274,6 +275,8 @@ def _informed(problem: Problem, point: FloatArray, moving: tuple[int, ...]) -> t
 
 
 def _trust_region(problem: Problem, starts: list[FloatArray]) -> Solution:
+    from scipy.optimize import least_squares
+
     chosen = list(problem.free)
     if not chosen:
         return Solution(starts[0], "no parameter is free", "none", 0)
