@@ -98,8 +98,8 @@ def _write_scan(
                 left -= 1
             if left:
                 written.remarks.append(
-                    f"scan {scan.scan}, {name}: {left} light positions that not every exposure "
-                    "has frames around"
+                    f"scan {scan.scan}, {name}: light positions that not every exposure has frames "
+                    f"around: {left}"
                 )
 
 
