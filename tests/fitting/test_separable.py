@@ -254,7 +254,7 @@ class TestBatch:
         variance[50, 1] = np.inf
         whole = fit_parameters(light, view, radiance, variance)
         other = np.asfortranarray(radiance)
-        other[:, 50, 1] = [np.nan, np.inf] * 10
+        other[:, 50, 1] = [np.nan, np.inf, 1e300, -9999.0] * 5
         for variances in (variance, np.asfortranarray(np.tile(variance, (20, 1, 1)))):
             found = fit_parameters(light, view, other, variances)
             np.testing.assert_allclose(found.values, whole.values, rtol=1e-9)

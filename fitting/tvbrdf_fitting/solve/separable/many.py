@@ -18,6 +18,9 @@ from .products import (
 from .search import search, solve_weighted
 from .widths import Sweep, nearest_seen, seen_amplitudes, shifted, widths_between
 
+_USUAL = 1e100
+"""No sum of squares of smaller values is inf, with any weight but an absurd one."""
+
 
 @njit(fastmath=SUMS, **JIT)
 def _all_positive(values):
@@ -28,11 +31,11 @@ def _all_positive(values):
 
 
 @njit(fastmath=SUMS, **JIT)
-def _all_finite(values):
-    total = 0.0
+def _all_usual(values):
+    good = True
     for i in range(values.shape[0]):
-        total += 0.0 * values[i]
-    return total == 0
+        good &= abs(values[i]) < _USUAL  # False for NaN
+    return good
 
 
 @njit(**JIT)
@@ -74,14 +77,17 @@ def _blank(squares, values):
 
 @njit(**JIT)
 def _take_radiance(values, rows, squares, radiance):
-    """Write values (n, 3) of some rows as (3, n), 0 without weight; say whether all are finite."""
+    """Write values (n, 3) of some rows as (3, n); say whether those with a weight are finite.
+
+    Without weight they become 0 where any is not finite or its square may not be.
+    """
     n = rows.shape[0]
     if rows[n - 1] - rows[0] == n - 1:
         some = values[rows[0] : rows[0] + n]
         # reading it straight on first also brings it near: transposing takes long from afar
-        finite = _all_finite(some.reshape(3 * n))
+        usual = _all_usual(some.reshape(3 * n))
         _transpose(some, radiance[0], radiance[1], radiance[2])
-        if finite:
+        if usual:
             return True
     else:
         for i in range(n):
