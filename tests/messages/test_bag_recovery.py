@@ -319,13 +319,13 @@ def test_a_killed_recorder_loses_a_second_at_most(tmp_path: Path) -> None:
     with pytest.raises(BagIncompleteError, match="its recorder was killed or it was cut"):
         BagReader(path)
     found = recovered(path)
-    count = len(found) // 2
     expected = [
         one(k, START_NS + k * 20_000_000)
-        for k in range(count)
+        for k in range(len(found) // 2 + 1)
         for one in (arm_state, lambda k, now_ns: frame(k, now_ns, shape=(40, 50)))
     ]
-    assert plain(found) == plain(expected)
+    # a recorder that had to wait may write its chunk between the two of a pair
+    assert plain(found) == plain(expected[: len(found)])
     assert last_ns - found[-1].log_time_ns <= 1_000_000_000
 
 
