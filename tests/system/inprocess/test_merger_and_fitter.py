@@ -219,24 +219,18 @@ def test_dark_frames_that_are_lost_break_the_first_sweep(record: Run, kept: int)
     frames = [e.message for e in record.messages if isinstance(e.message, Frame)]
     got = len([f for f in frames if (f.camera, f.kind) == ("camera_2", "dark") and f.index < kept])
     assert got < sent
-    # on a busy machine the recorded run itself may have taken a sweep twice
-    with Bench(record.graph, "hdr_merger") as bench:
-        bench.feed(record)
-        whole, lost = bench.results(), bench.counters["frames_lost"]
     with Bench(record.graph, "hdr_merger") as bench:
         bench.feed(record, lose)
         reason = f"camera_2 sent {sent} dark frames, {got} arrived"
         assert bench.results()[0] == (0, "broken", reason)
-        assert bench.counters["frames_lost"] == sent - got + lost
+        assert bench.counters["frames_lost"] == sent - got
         assert not bench.published(Radiance)
         bench.graph.bus.taps.clear()
-        bench.feed(
-            record, lambda e, m: new(e, attempt=m.attempt + 1) if hasattr(m, "attempt") else e
-        )
-        assert bench.results() == whole
+        bench.feed(record, lambda e, m: new(e, attempt=2) if hasattr(m, "attempt") else e)
+        assert bench.results() == [(0, "done", ""), (1, "done", "")]
         (radiance,) = bench.published(Radiance)
         assert radiance.radiance.tobytes() == record.radiance[0].radiance.tobytes()
-        assert bench.counters["frames_lost"] == sent - got + 2 * lost
+        assert bench.counters["frames_lost"] == sent - got
 
 
 def test_dark_frames_with_light_in_them_break_the_sweep(record: Run) -> None:
