@@ -82,60 +82,38 @@ def _write_sums(a0, a1, a2, ks, radiance, squares, x0, x1, x2, lobe, slope, bend
 
 
 @njit(fastmath=SUMS, **JIT)
-def _add_residual_sums(weights, f, q, scale, r0, r1, r2, s0, s1, s2, x0, x1, x2, lobe, sums):
-    """Add the sums of r with r, the vectors, the lobe and its slope: the first six of all, (3, 6).
+def _with_row(sums, a, value, square, one, two, three, p, d):
+    """Return a channel's six sums with those of a row; `a` are the factors of its vectors."""
+    r = (a[0] * one + a[1] * two + a[2] * three + a[3] * p) - value
+    w = square * r
+    return (
+        sums[0] + w * r,
+        sums[1] + w * one,
+        sums[2] + w * two,
+        sums[3] + w * three,
+        sums[4] + w * p,
+        sums[5] + w * d,
+    )
 
-    `weights` (3, 4) are the factors of the vectors and of the lobe in each channel.
+
+@njit(fastmath=SUMS, **JIT)
+def _residual_sums(a, b, c, f, q, scale, r0, r1, r2, s0, s1, s2, x0, x1, x2, lobe):
+    """Return for each channel the sums of r with r, the vectors, the lobe and its slope.
+
+    `a`, `b`, `c` are the channels' factors of the vectors and of the lobe, which is written. All
+    channels are summed in one pass: what they share is read once.
     """
     for i in range(f.shape[0]):
         lobe[i] = f[i] * exp_negative(q[i] * scale)
-    a0, a1, a2, a3 = weights[0, 0], weights[0, 1], weights[0, 2], weights[0, 3]
-    b0, b1, b2, b3 = weights[1, 0], weights[1, 1], weights[1, 2], weights[1, 3]
-    c0, c1, c2, c3 = weights[2, 0], weights[2, 1], weights[2, 2], weights[2, 3]
-    o0 = o1 = o2 = o3 = o4 = o5 = 0.0
-    p0 = p1 = p2 = p3 = p4 = p5 = 0.0
-    t0 = t1 = t2 = t3 = t4 = t5 = 0.0
+    one = two = three = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for i in range(f.shape[0]):
-        one, two, three, p = x0[i], x1[i], x2[i], lobe[i]
+        u, v, w, p = x0[i], x1[i], x2[i], lobe[i]
         # far out the lobe is 0 to all digits, and 0 x inf must not arise
         d = -2.0 * min(q[i] * scale, 1e3) * p
-        r = (a0 * one + a1 * two + a2 * three + a3 * p) - r0[i]
-        w = s0[i] * r
-        o0 += w * r
-        o1 += w * one
-        o2 += w * two
-        o3 += w * three
-        o4 += w * p
-        o5 += w * d
-        r = (b0 * one + b1 * two + b2 * three + b3 * p) - r1[i]
-        w = s1[i] * r
-        p0 += w * r
-        p1 += w * one
-        p2 += w * two
-        p3 += w * three
-        p4 += w * p
-        p5 += w * d
-        r = (c0 * one + c1 * two + c2 * three + c3 * p) - r2[i]
-        w = s2[i] * r
-        t0 += w * r
-        t1 += w * one
-        t2 += w * two
-        t3 += w * three
-        t4 += w * p
-        t5 += w * d
-    for m, (o, p, t) in enumerate(
-        (
-            (o0, p0, t0),
-            (o1, p1, t1),
-            (o2, p2, t2),
-            (o3, p3, t3),
-            (o4, p4, t4),
-            (o5, p5, t5),
-        )
-    ):
-        sums[0, m] += o
-        sums[1, m] += p
-        sums[2, m] += t
+        one = _with_row(one, a, r0[i], s0[i], u, v, w, p, d)
+        two = _with_row(two, b, r1[i], s1[i], u, v, w, p, d)
+        three = _with_row(three, c, r2[i], s2[i], u, v, w, p, d)
+    return one, two, three
 
 
 @njit(**JIT)
@@ -243,24 +221,26 @@ def normal_equations(x, scan, known, columns, gradient, matrix, hessian):
 
 
 @njit(**JIT)
+def _factors(x, c, coefficients):
+    kd, ks = x[c], x[4 + c] if x.shape[0] == 8 else x[4]
+    return kd * coefficients[0], kd * coefficients[1], kd * kd * coefficients[2], ks
+
+
+@njit(**JIT)
 def cost_and_gradient(x, scan, falloff, gradient):
     """Return what `normal_equations` does, of true residuals; write only the gradient.
 
     `falloff` (n,) is overwritten.
     """
-    last = x.shape[0] - 1
     coefficients = diffuse_coefficients(x[3], scan.form)
-    weights, sums = np.empty((3, 4)), np.zeros((3, 6))
-    for c in range(3):
-        kd = x[c]
-        weights[c, 0], weights[c, 1] = kd * coefficients[0], kd * coefficients[1]
-        weights[c, 2], weights[c, 3] = kd * kd * coefficients[2], x[4 + c] if last == 7 else x[4]
     r, s, v = scan.radiance, scan.squares, scan.vectors
-    _add_residual_sums(
-        weights,
+    sums = _residual_sums(
+        _factors(x, 0, coefficients),
+        _factors(x, 1, coefficients),
+        _factors(x, 2, coefficients),
         scan.f,
         scan.q,
-        math.exp(2 * x[last]),
+        math.exp(2 * x[x.shape[0] - 1]),
         r[0],
         r[1],
         r[2],
@@ -271,7 +251,6 @@ def cost_and_gradient(x, scan, falloff, gradient):
         v[1],
         v[2],
         falloff,
-        sums,
     )
     gradient[:] = 0.0
     cost = 0.0
